@@ -41,7 +41,7 @@ BARE: Final = "imagined and drawn"
 
 def learned_rewards(model: ActionWorldModelRewardModel) -> dict[str, PreTrainedRewardModel]:
     """Proxy and embedding, untrained."""
-    config, device = model.config, model.state_mean.device.type
+    config, device = model.config, model.device.type
     sizes = config.tokenizer
     proxy = ProxyConfig(device=device, cameras=sizes.cameras, image_size=sizes.image_size)
     embedding = EmbeddingConfig(device=device, world_model="untrained", hidden_size=config.dynamics.width)
@@ -54,7 +54,7 @@ def learned_rewards(model: ActionWorldModelRewardModel) -> dict[str, PreTrainedR
 def environments(config: WorldModelEnv, models: WorldModels, count: int) -> dict[str, WorldModelVectorEnv]:
     """One of each reward."""
     frames = read_start_images(config.dataset, models.model.config)
-    device = models.model.state_mean.device.type
+    device = models.model.device.type
     goalless = models._replace(text_model=None)
     sparse = goalless._replace(reward=GeneralRewardModel(GeneralConfig(device=device, alpha=1.0)))
     variants = {
@@ -86,7 +86,7 @@ def tensor_bytes() -> int:
 
 def measure(config: WorldModelEnv, models: WorldModels, count: int) -> dict[str, Any]:
     """Frames a second of everything at one number of environments, and what each reward adds."""
-    device = models.model.state_mean.device
+    device = models.model.device
     bare = Imagination(models.model, count, torch.float32, device)
     before = tensor_bytes()
     envs = environments(config, models, count)

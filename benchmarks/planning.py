@@ -45,7 +45,7 @@ SETTINGS: Final = {
 
 def measure(model: ActionWorldModelRewardModel, searches: int, matmul: float) -> dict[str, Any]:
     """Return all rates at one number of searches at once."""
-    device = model.state_mean.device
+    device = model.device
     frames, tasks = start_frames(model, searches, device), [""] * searches
     low, high = (torch.tensor(bound, device=device) for bound in (ACTION_LOW, ACTION_HIGH))
     near = SETTINGS["near_a_policy"]
@@ -96,7 +96,7 @@ def main() -> None:
     register_third_party_plugins()
     given = make_parser().parse_args()
     model = make_model(given, ())
-    device = model.state_mean.device
+    device = model.device
     dtype = imagination_dtype(device)
     matmul = matmul_rate(dtype, device)
     figures = {

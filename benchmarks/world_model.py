@@ -52,7 +52,7 @@ def measure_batch(
     model: ActionWorldModelRewardModel, batch: int, matmul: float, stream: float
 ) -> dict[str, Any]:
     """All rates (frames a second) at one batch size, and their shares of the floor."""
-    device = model.state_mean.device
+    device = model.device
     dtype = imagination_dtype(device)
     fast, plain = (Imagination(model, batch, kind, device) for kind in (dtype, torch.float32))
     frames = batch * model.config.clip_length
@@ -170,7 +170,7 @@ def main() -> None:
     if flags and given.world_model:
         parser.error(f"{' '.join(flags)}: a checkpoint's model is as it was trained; flags need --sizes")
     model = make_model(given, flags)
-    device = model.state_mean.device
+    device = model.device
     dtype = imagination_dtype(device)
     matmul, stream = matmul_rate(dtype, device), stream_rate(device)
     config = model.config

@@ -37,7 +37,7 @@ from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import chosen_episodes
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_world_model_env
-from lerobot_wmrl.evaluation.gate import Outcomes
+from lerobot_wmrl.evaluation.outcomes import Outcomes
 from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig

@@ -21,7 +21,8 @@ from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_features
-from lerobot_wmrl.evaluation.gate import Outcomes, PredictedDone, gate_at
+from lerobot_wmrl.evaluation.gate import gate_at
+from lerobot_wmrl.evaluation.outcomes import Outcomes, PredictedDone
 from lerobot_wmrl.world_models.checkpoint import load_model
 
 

@@ -51,10 +51,10 @@ class Checkpoint:
     path: str = ""
 
 
-def resolve_checkpoint(path: str | Path) -> Path:
+def model_folder(path: str | Path) -> Path:
     """Return the `pretrained_model` folder inside a training's output folder or one of its checkpoints."""
     root = Path(path)
-    for candidate in (root, root / PRETRAINED_MODEL_DIR, last_checkpoint(root)):
+    for candidate in (root, root / PRETRAINED_MODEL_DIR, last_model(root)):
         if (candidate / "config.json").is_file():
             return candidate
     return root
@@ -66,7 +66,7 @@ def resolved_path(path: str) -> str:
     A training's output folder and its link `last` become the checkpoint behind them: a longer training moves
     the link on. A path that is no folder is returned as it is: it may be a hub id.
     """
-    folder = resolve_checkpoint(path)
+    folder = model_folder(path)
     if not folder.is_dir():
         return path
     folder = folder.resolve()
@@ -79,19 +79,19 @@ def resolved_name(path: str) -> str:
     return str(folder.parent if folder.name == PRETRAINED_MODEL_DIR else folder)
 
 
-def local_checkpoint(path: str | Path, files: Sequence[str] | None = None) -> Path:
+def local_model_folder(path: str | Path, files: Sequence[str] | None = None) -> Path:
     """Return the folder with a checkpoint's model. One on the hub is downloaded into its cache, all of it or
     the files of some patterns."""
-    folder = resolve_checkpoint(path)
+    folder = model_folder(path)
     return folder if folder.is_dir() else Path(snapshot_download(str(path), allow_patterns=files))
 
 
-def last_checkpoint(folder: Path) -> Path:
+def last_model(folder: Path) -> Path:
     """Return the model of the last checkpoint of a training command that writes to `folder`."""
     return folder / LAST_CHECKPOINT / PRETRAINED_MODEL_DIR
 
 
-def best_checkpoint(folder: Path) -> Path:
+def best_model(folder: Path) -> Path:
     """Return the model of the best checkpoint of a training with selection that writes to `folder`."""
     return folder / CHECKPOINTS_DIR / BEST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR
 
@@ -150,7 +150,7 @@ def checkpoint_digest(path: str | Path, parts: bool = True) -> str:
         parts: whether models on this machine that it is made of count too: what an adapter was trained on,
             the world model of a planner.
     """
-    folder, digest = local_checkpoint(path, MODEL_FILES), hashlib.sha256()
+    folder, digest = local_model_folder(path, MODEL_FILES), hashlib.sha256()
     for file in sorted(each for pattern in MODEL_FILES for each in folder.glob(pattern)):
         digest.update(f"{file.name} {file_digest(file)}".encode())
     for part in parts_of(folder) if parts else ():
@@ -167,7 +167,7 @@ def file_digest(path: Path) -> str:
 def parts_of(folder: Path) -> list[Path]:
     """Return the checkpoints on this machine that a checkpoint's settings name."""
     settings = [json.loads(path.read_text()) for name in SETTINGS if (path := folder / name).is_file()]
-    named = [resolve_checkpoint(each[key]) for each in settings for key in PARTS if each.get(key)]
+    named = [model_folder(each[key]) for each in settings for key in PARTS if each.get(key)]
     return [part for part in named if part.is_dir() and part != folder]
 
 
@@ -187,16 +187,20 @@ def read_weights(checkpoint: Path, folder: str = PRETRAINED_MODEL_DIR) -> dict[s
         ) from error
 
 
-def latest_checkpoint(output_dir: Path) -> Path | None:
-    """Return the whole checkpoint of the highest step, None without one."""
-    folder = output_dir / CHECKPOINTS_DIR
-    steps = [path for path in folder.glob("*") if path.name.isdigit()] if folder.is_dir() else []
-    return max(steps, key=lambda path: int(path.name), default=None)
+def step_folders(output_dir: Path) -> list[Path]:
+    """List the checkpoints `checkpoints/<step>` of a training in the order of their steps."""
+    found = (path for path in (output_dir / CHECKPOINTS_DIR).glob("*") if path.name.isdigit())
+    return sorted(found, key=lambda path: int(path.name))
+
+
+def newest_checkpoint(output_dir: Path) -> Path | None:
+    """Return the checkpoint of the highest step, None without one: `write_checkpoint` leaves whole ones."""
+    return next(reversed(step_folders(output_dir)), None)
 
 
 def link_latest(output_dir: Path) -> None:
     """Point `last` at the latest checkpoint, if there is one: a kill may have come between the two."""
-    checkpoint = latest_checkpoint(output_dir)
+    checkpoint = newest_checkpoint(output_dir)
     linked = (output_dir / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK).resolve()
     if checkpoint is not None and linked != checkpoint.resolve():
         link_checkpoint(checkpoint, LAST_CHECKPOINT_LINK)
@@ -204,7 +208,7 @@ def link_latest(output_dir: Path) -> None:
 
 def require_resumable(output_dir: Path) -> None:
     """Raise FieldError if `resume` is asked for and there is no checkpoint to go on from."""
-    if latest_checkpoint(output_dir) is None:
+    if newest_checkpoint(output_dir) is None:
         raise FieldError(
             "resume", True, f"there is no checkpoint in {output_dir} to go on from",
             "leave `resume` out to begin",

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import draccus
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.utils import flatten_dict
 
-from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT
+from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, step_folders
 from lerobot_wmrl.common.presets import Flags, format_flags
 
 DERIVED = ("features", "features_map")
@@ -30,8 +30,7 @@ def whole_checkpoint(folder: Path) -> Path | None:
     """Return the newest checkpoint of lerobot-train that is whole for certain: the one that `last` points to
     or, where a kill left no link, the one before the newest."""
     last = folder / LAST_CHECKPOINT
-    steps = sorted(each for each in (folder / CHECKPOINTS_DIR).glob("*") if each.name.isdigit())
-    return last if last.exists() else next(iter(steps[-2:-1]), None)
+    return last if last.exists() else next(iter(step_folders(folder)[-2:-1]), None)
 
 
 def merge_command(folder: Path, datasets: Mapping[str, Path]) -> list[str]:

@@ -14,7 +14,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from lerobot_wmrl.common.checkpoints import ADAPTERS_FILE, local_checkpoint, resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import ADAPTERS_FILE, local_model_folder, model_folder
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.files import whole_folder
@@ -22,7 +22,7 @@ from lerobot_wmrl.common.files import whole_folder
 
 def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
     """Read the configuration of a policy's checkpoint. Raises FieldError if it is none."""
-    folder = resolve_checkpoint(path)
+    folder = model_folder(path)
     if not (folder / "config.json").is_file() and (folder.exists() or path.startswith((".", "/"))):
         raise FieldError(
             "policy.path", path, "no checkpoint there (config.json is missing)",
@@ -52,7 +52,7 @@ def copy_checkpoint(config: PreTrainedConfig, folder: Path, preprocessor: Any = 
     """
     if folder.exists():
         return
-    source = local_checkpoint(str(config.pretrained_path))
+    source = local_model_folder(str(config.pretrained_path))
     with whole_folder(folder) as partial:
         config.save_pretrained(partial)
         if preprocessor is not None:

@@ -39,7 +39,7 @@ class Clip(NamedTuple):
         depth: (B, T, S) metres of each token, for models that look at depth.
         context: context of the B episodes' first frames, for models that look at it.
         features: (B, T, F) of the frames, by the tokenizer's success classifier, if it has one.
-        success_weight: of a frame with success in the loss of done.
+        done_pos_weight: of a frame with success in the loss of done.
     """
 
     tokens: Tensor
@@ -52,7 +52,7 @@ class Clip(NamedTuple):
     depth: Tensor | None = None
     context: Context = NO_CONTEXT
     features: Tensor | None = None
-    success_weight: float = 1.0
+    done_pos_weight: float = 1.0
 
     def first(self) -> Frames:
         """Return the clips' first frames."""
@@ -109,7 +109,7 @@ class ClipSampler:
         done = np.concatenate([self.table.success_target[rows] for rows in self.table.rows(self.episodes)])
         odds = SUCCESS_SHARE / (1 - SUCCESS_SHARE)
         rarity = float(odds * (~done).sum() / done.sum()) if done.any() else 1.0
-        self.success_weight = min(max(1.0, rarity), MOST_WEIGHT)
+        self.done_pos_weight = min(max(1.0, rarity), MOST_WEIGHT)
 
     def __call__(self, step: int) -> Clip:
         """Draw the batch of one training step."""
@@ -140,7 +140,7 @@ class ClipSampler:
             depth=None if self.depth is None else self._tensor(self.depth[rows]),
             context=context,
             features=None if self.features is None else self._tensor(self.features[rows]),
-            success_weight=self.success_weight,
+            done_pos_weight=self.done_pos_weight,
         )
 
     def _tensor(self, array: np.ndarray) -> Tensor:

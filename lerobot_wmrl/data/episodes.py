@@ -131,6 +131,12 @@ class EpisodeTable:
                 )  # fmt: skip
         return indices >= 0 if chosen is None else np.isin(indices, chosen)
 
+    def training(self, chosen: Sequence[int] | None) -> np.ndarray:
+        """Mark the episodes that models learn from: the `chosen` ones, all if None, that are not held out.
+        FieldError names one that does not exist. (E,)"""
+        marked: np.ndarray = self.among(chosen) & ~self.validation
+        return marked
+
 
 def count_tasks(tables: Sequence[EpisodeTable]) -> int:
     """Return how many tasks the episodes of several datasets are of.

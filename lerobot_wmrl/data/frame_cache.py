@@ -36,11 +36,12 @@ class FrameEncoder(Protocol):
     image_size: int
 
     @property
+    def device(self) -> torch.device:
+        """Where its weights are."""
+
+    @property
     def tokens_per_frame(self) -> int:
         """S, tokens of all cameras."""
-
-    def parameters(self) -> Iterator[torch.nn.Parameter]:
-        """Return its weights, which lie on its device."""
 
     def state_dict(self) -> Mapping[str, Tensor]:
         """Return weights and running statistics, which the caches' names depend on."""
@@ -88,7 +89,7 @@ def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer
     A context-conditioned tokenizer is given the first frame of each row's episode.
     """
     frames = cached_frames(dataset, camera_keys, tokenizer.image_size)
-    device = next(tokenizer.parameters()).device
+    device = tokenizer.device
     starts = first_rows(dataset)
 
     def encode(part: slice) -> np.ndarray:
@@ -111,7 +112,7 @@ def cached_context(
     float32 (E, N, C, g, g), encoded on the first call.
     """
     frames = cached_frames(dataset, camera_keys, tokenizer.image_size)
-    device = next(tokenizer.parameters()).device
+    device = tokenizer.device
     starts = np.asarray(dataset.meta.episodes["dataset_from_index"])
 
     def features(part: slice) -> np.ndarray:
@@ -132,7 +133,7 @@ def cached_features(
     float32 (rows, F), encoded on the first call.
     """
     frames = cached_frames(dataset, camera_keys, tokenizer.image_size)
-    device = next(tokenizer.parameters()).device
+    device = tokenizer.device
     starts = first_rows(dataset)
 
     def features(part: slice) -> np.ndarray:

@@ -62,18 +62,21 @@ class Frames:
         state: (B, P), in the dataset's units.
         context: context of the first frames of the B episodes, where the tokenizer is conditioned on them.
         depth: (B, S) metres of each token, for world models that look at depth.
-        success_weights: (B, E), by which the instruction lets success be read, for world models that read it.
+        instruction_weights: (B, E), by which the instruction lets success be read, for world models that
+            read it.
     """
 
     tokens: Tensor
     state: Tensor
     context: Context = NO_CONTEXT
     depth: Tensor | None = None
-    success_weights: Tensor | None = None
+    instruction_weights: Tensor | None = None
 
     def __getitem__(self, rows: Any) -> "Frames":
         """Return some of the B rows: an index, mask or slice of the first dimension."""
-        depth, weights = (each if each is None else each[rows] for each in (self.depth, self.success_weights))
+        depth, weights = (
+            each if each is None else each[rows] for each in (self.depth, self.instruction_weights)
+        )
         return Frames(self.tokens[rows], self.state[rows], self.context[rows], depth, weights)
 
     def __len__(self) -> int:

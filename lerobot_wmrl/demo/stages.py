@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from lerobot_wmrl.common.checkpoints import last_checkpoint
+from lerobot_wmrl.common.checkpoints import last_model
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
@@ -163,7 +163,7 @@ class Demo:
 
     @property
     def _policy(self) -> str:
-        return str(last_checkpoint(self.out / "cloned"))
+        return str(last_model(self.out / "cloned"))
 
     def _demonstrations(self) -> list[str]:
         return self._command("lerobot-wmrl-record", {

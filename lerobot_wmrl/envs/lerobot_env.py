@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError, within
-from lerobot_wmrl.common.policies import check_fit, seen_shape
+from lerobot_wmrl.common.policies import LoadedPolicy, check_fit, learnt_range, seen_shape
 from lerobot_wmrl.envs.configuration_hub import HubEnv
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.tensor_env import Outcome, TensorEnv
@@ -150,6 +150,11 @@ class LeRobotTensorEnv(TensorEnv):
         self.max_episode_steps = max(self._limits)
         self.metadata = {"render_fps": config.fps, "autoreset_mode": AutoresetMode.SAME_STEP}
         self._length = np.zeros(n_envs, np.int64)
+
+    def accept(self, policy: LoadedPolicy) -> None:
+        """Let actions reach as far as those that the policy has learnt from, where it says so."""
+        if learnt := learnt_range(policy.postprocessor):
+            self.widen(*learnt)
 
     def widen(self, low: Tensor, high: Tensor) -> None:
         """Let actions reach as far as those that a policy has learnt from, (A,) each; warn where that is new.

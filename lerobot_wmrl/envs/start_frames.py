@@ -1,11 +1,9 @@
-"""Where imagined episodes begin, and the goal frame of each.
+"""Frames at which imagined episodes begin, from a dataset's episodes, a file or ManiSkill's resets.
 
-Frames are read from a dataset's episodes, from a file or from ManiSkill's resets (`StartImages`). A
-world model then tokenises them (`Starts`), and the text world model imagines their goal frames
-(`GoalFeatures`). K is the number of starts, N the number of cameras.
+A world model tokenises them then (`starts`). K is the number of starts, N the number of cameras.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,30 +20,22 @@ from lerobot_wmrl.common.images import stretch, to_pixels
 from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.episodes import EpisodeTable, choose_episodes, read_episodes
-from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
-from lerobot_wmrl.data.frames import Context, Frames
+from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.maniskill.recordings import require_unreported, scene_splits
 from lerobot_wmrl.maniskill.scenes import scene_for_seed
 from lerobot_wmrl.maniskill.tasks import task_of
-from lerobot_wmrl.rewards.similarity import Features, Similarity
 from lerobot_wmrl.world_models.checkpoint import check_dataset
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
-from lerobot_wmrl.world_models.goal import imagine_goal
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
 from lerobot_wmrl.world_models.modeling_world_model import (
-    ActionWorldModelRewardModel,
-    TextWorldModelRewardModel,
     WorldModelRewardModel,
 )
 
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 """Its multiples, modulo 1, are spread over the unit interval, any of them in a row."""
-
-STARTS_AT_ONCE = 64
-"""Starts that are tokenised, and goal frames that are imagined, at once."""
 
 
 class StartImages(NamedTuple):
@@ -84,28 +74,6 @@ class StartImages(NamedTuple):
             tasks=self.tasks[rows],
             depth=depth,
         )
-
-
-class Starts(NamedTuple):
-    """K starts, tokenised: their frames, with the context of their episodes' first frames, the images
-    (K, N, 3, H, W) that these decode to, and K instructions."""
-
-    frames: Frames
-    images: Tensor
-    instructions: list[str]
-
-    def __len__(self) -> int:
-        return len(self.instructions)
-
-
-class GoalFeatures(NamedTuple):
-    """Goal frames of K starts: their features [(K·N, …)] and the measure that compares them, the similarity
-    of each start to its goal (K,), and reached (K,), False where the text model never reached θ."""
-
-    features: Features
-    measure: Similarity
-    similarity: Tensor
-    reached: Tensor
 
 
 def read_start_images(source: StartFrames, config: WorldModelConfig) -> StartImages:
@@ -350,61 +318,3 @@ def without_depth(model: WorldModelRewardModel) -> None:
             "dataset.root", None, "this world model looks at depth, which saved frames and resets lack",
             "give a dataset that was recorded with depth",
         )  # fmt: skip
-
-
-@torch.no_grad()
-def load_starts(
-    frames: StartImages, model: ActionWorldModelRewardModel, text_model: TextWorldModelRewardModel | None,
-    measure: Similarity,
-) -> tuple[Starts, GoalFeatures | None]:  # fmt: skip
-    """Tokenise the starts and, with a text model, imagine each one's goal frame once (eq. 6)."""
-    device = model.state_mean.device
-    state = torch.from_numpy(frames.state).to(device)
-    tokens, images, contexts, features = [], [], [], []
-    for part in in_parts(len(state)):
-        first, shown = (frames_to_tensor(of[part]).to(device) for of in (frames.first_images, frames.images))
-        contexts.append(model.tokenizer.context(first))
-        tokens.append(model.tokenizer.encode(shown, contexts[-1]))
-        decoded = model.tokenizer.decode_with_features(tokens[-1], contexts[-1])
-        images.append(decoded.images)
-        if text_model is not None:
-            features.append(measure.features(decoded))
-    begin = Frames(torch.cat(tokens), state, Context.joined(contexts))
-    start_frames = replace(
-        begin, state=state[:, : model.config.state_size], depth=frames.depth(model),
-        success_weights=model.success_weights(frames.instructions, len(state)),
-    )  # fmt: skip
-    starts = Starts(start_frames, torch.cat(images), frames.instructions)
-    if text_model is None:
-        return starts, None
-    begin = replace(begin, depth=frames.depth(text_model))
-    goals = imagine_goal_features(text_model, begin, frames.instructions, joined(features), measure)
-    return starts, goals
-
-
-def in_parts(count: int) -> list[slice]:
-    """Cut `count` starts into parts of at most `STARTS_AT_ONCE`."""
-    return [slice(begin, begin + STARTS_AT_ONCE) for begin in range(0, count, STARTS_AT_ONCE)]
-
-
-def joined(parts: Sequence[Features]) -> Features:
-    """Put the features of several parts together."""
-    return [torch.cat(each) for each in zip(*parts, strict=True)]
-
-
-@torch.no_grad()
-def imagine_goal_features(
-    model: TextWorldModelRewardModel, frames: Frames, instructions: list[str], features: Features,
-    measure: Similarity,
-) -> GoalFeatures:  # fmt: skip
-    """Imagine the goal frame of every start.
-
-    Args:
-        frames: the first frames of the K starts, as the text model is given them.
-        instructions: one for each.
-        features: features of the first frames, as `measure` computes them, [(K·N, …)].
-    """
-    goals = [imagine_goal(model, frames[part], instructions[part]) for part in in_parts(len(frames))]
-    goal_features = joined([measure.features(goal.decoded) for goal in goals])
-    similarity = measure(features, goal_features, model.tokenizer.num_cameras)
-    return GoalFeatures(goal_features, measure, similarity, torch.cat([goal.reached for goal in goals]))

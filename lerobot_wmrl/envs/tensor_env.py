@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import Observation
+from lerobot_wmrl.common.policies import LoadedPolicy
 
 NO_PARTS: Final[Mapping[str, Tensor]] = MappingProxyType({})
 
@@ -95,6 +96,9 @@ class TensorEnv(gym.vector.VectorEnv):
             info["final_info"] = {"is_success": outcome.success, "episode_length": outcome.length}
             observation = self._restart(ended, outcome)
         return observation, outcome.reward, outcome.terminated, outcome.truncated, info
+
+    def accept(self, policy: LoadedPolicy) -> None:
+        """Make ready for a policy's actions. FieldError if they are in other units than the environment's."""
 
     def repeats_starts(self) -> bool:
         """Return whether the same seed gives the same start."""

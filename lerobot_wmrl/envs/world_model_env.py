@@ -15,10 +15,12 @@ from torch import Tensor
 from torch.distributions import Bernoulli
 
 from lerobot_wmrl.common.constants import Observation
+from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.envs.start_frames import GoalFeatures, StartImages, Starts, load_starts, read_start_images
+from lerobot_wmrl.envs.start_frames import StartImages, read_start_images
+from lerobot_wmrl.envs.starts import GoalFeatures, Starts, load_starts
 from lerobot_wmrl.envs.tensor_env import Outcome, TensorEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, is_done
@@ -78,6 +80,10 @@ class WorldModelVectorEnv(TensorEnv):
 
         shapes = self.model.config.observation_shapes
         return gym.spaces.Dict({key: box(key, shape) for key, shape in shapes.items()})
+
+    def accept(self, policy: LoadedPolicy) -> None:
+        """Raise FieldError if the policy acts in other units than the world model's dataset has."""
+        self.model.check_units(policy.config, policy.postprocessor)
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
@@ -227,7 +233,7 @@ def load_world_models(config: WorldModelEnv, device: str | None) -> WorldModels:
     if config.text_world_model_path:
         text_model = load_model(config.text_world_model_path, "text_world_model", device)
         check_same_tokenizer(model, text_model, "text_world_model_path", config.text_world_model_path)
-    measure = make_similarity(getattr(config.reward, "similarity", "tokenizer"), model.state_mean.device)
+    measure = make_similarity(getattr(config.reward, "similarity", "tokenizer"), model.device)
     return WorldModels(model, text_model, measure, load_reward(config.reward, model, config.horizon))
 
 
@@ -268,7 +274,7 @@ def load_spread_starts(model: ActionWorldModelRewardModel, source: StartFrames, 
     """Read and tokenise at most so many of the starts that `source` names, spread evenly."""
     frames = read_start_images(source, model.config)
     frames = frames.chosen(evenly_spaced(len(frames.images), at_most))
-    return load_starts(frames, model, None, make_similarity("tokenizer", model.state_mean.device))[0]
+    return load_starts(frames, model, None, make_similarity("tokenizer", model.device))[0]
 
 
 def make_success_env(env: WorldModelVectorEnv, starts: Starts) -> WorldModelVectorEnv:

@@ -13,7 +13,6 @@ from lerobot_wmrl.common.statistics import Estimate, Proportion, bootstrap_ratio
 from lerobot_wmrl.data.embodiment import POSITION_NAMES, component_names
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frames import Context
-from lerobot_wmrl.evaluation.gate import first_run
 from lerobot_wmrl.evaluation.image_metrics import (
     PerceptualDistance,
     depth_accuracy,
@@ -23,6 +22,7 @@ from lerobot_wmrl.evaluation.image_metrics import (
     psnr,
     ssim,
 )
+from lerobot_wmrl.evaluation.outcomes import first_run
 from lerobot_wmrl.evaluation.replay import (
     BATCH,
     DELTA_PSNR_SECONDS,
@@ -254,7 +254,7 @@ def robustness(
 
     Frozen actions cannot succeed and ought to leave the image as it is.
     """
-    episodes, device = episodes[evenly_spaced(len(episodes), BATCH)], model.state_mean.device
+    episodes, device = episodes[evenly_spaced(len(episodes), BATCH)], model.device
     table, horizon = recording.table, recording.steps(HORIZON_SECONDS)
     starts, recorded = recording.starts(model, episodes), recording.actions(episodes, horizon, device)
     absolute = absolute_control(table)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot.utils.constants import CHECKPOINTS_DIR
 from scipy.stats import pearsonr
 
+from lerobot_wmrl.common.checkpoints import step_folders
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.statistics import Proportion
 
@@ -22,10 +22,7 @@ def policy_checkpoints(paths: Sequence[str]) -> list[Path]:
     Raises:
         FieldError: there is none.
     """
-    checkpoints = []
-    for path in map(Path, paths):
-        steps = [each for each in (path / CHECKPOINTS_DIR).glob("*") if each.name.isdigit()]
-        checkpoints += sorted(steps, key=lambda each: int(each.name)) or [path]
+    checkpoints = [each for path in map(Path, paths) for each in step_folders(path) or [path]]
     if not checkpoints:
         raise FieldError("policies", list(paths), "none", "give checkpoints, or output folders of trainings")
     return checkpoints

@@ -3,10 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from pathlib import Path
 from typing import Any, Final, NamedTuple
-
-from matplotlib.figure import Figure
 
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
 from lerobot_wmrl.evaluation.sequential import SequentialTest
@@ -134,7 +131,7 @@ class Comparison:
         }
 
     def as_json(self) -> dict[str, Any]:
-        """Return results and episodes as JSON, from which `read_episodes` continues."""
+        """Return results and episodes as JSON, from which `episodes_from_json` continues."""
         return {
             "policies": as_json(self.rates()),
             "by_task": {task: as_json(rates) for task, rates in self.rates_by_task().items()},
@@ -174,7 +171,7 @@ def as_json(rates: Mapping[str, Proportion]) -> dict[str, Any]:
     return {name: rate.as_json() for name, rate in rates.items()}
 
 
-def read_episodes(results: Mapping[str, Any]) -> list[Episode]:
+def episodes_from_json(results: Mapping[str, Any]) -> list[Episode]:
     """Return the episodes of a comparison that was written as JSON."""
     return [Episode(**episode) for episode in results["episodes"]]
 
@@ -208,19 +205,3 @@ def require_finished(results: Mapping[str, Any]) -> None:
     """Raise ValueError if a comparison, written as JSON, was interrupted."""
     if not results["finished"]:
         raise ValueError("the comparison is not finished: run its command again")
-
-
-def save_picture(comparison: Comparison, path: Path) -> None:
-    """Draw the success rates with their 95 % intervals."""
-    rates = comparison.rates()
-    figure = Figure(figsize=(7, 1.2 + 0.5 * len(rates)), layout="constrained")
-    axes = figure.subplots()
-    for place, rate in enumerate(rates.values()):
-        axes.barh(place, rate.share, 0.6, color="#2b6cb0")
-        axes.errorbar(rate.share, place, xerr=rate.whiskers, color="#333", capsize=4)
-    axes.set_yticks(range(len(rates)), list(rates))
-    axes.invert_yaxis()
-    axes.set_xlim(0, 1)
-    axes.set_xlabel(f"success rate over {len(comparison.episodes)} starts, with 95 % intervals")
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=130)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 
-from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import model_folder
 from lerobot_wmrl.common.constants import DYNA, START_SCENE
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.output_folders import CONFIG_FILE
@@ -19,7 +19,8 @@ from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, choose_episodes, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.evaluation.calibration import Confusion
-from lerobot_wmrl.evaluation.gate import Outcomes, gate_at, labelled_recording, predict_outcomes
+from lerobot_wmrl.evaluation.gate import gate_at
+from lerobot_wmrl.evaluation.outcomes import Outcomes, labelled_recording, predict_outcomes
 from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.maniskill.recordings import scene_splits
 from lerobot_wmrl.world_models.checkpoint import load_model
@@ -162,7 +163,7 @@ def trained_inside(policy: str, world_model: str) -> str | None:
             return (
                 "it was trained in this world model, and may have learnt what only looks like success there"
             )
-    planner = stored_settings(resolve_checkpoint(policy) / "config.json").get("world_model_path")
+    planner = stored_settings(model_folder(policy) / "config.json").get("world_model_path")
     if planner and same_training(planner, world_model):
         return "it plans in this world model, and finds what only looks like success there"
     return None
@@ -186,8 +187,8 @@ def learnt_from(world_model: str, rollouts: LabelledRollouts) -> int:
     table, chosen = rollouts.table, rollouts.chosen
     same = [root == rollouts.name or _same(Path(root), Path(rollouts.name)) for root, _ in learnt]
     if any(same):
-        parts = [table.among(episodes) for (_, episodes), equal in zip(learnt, same, strict=True) if equal]
-        return int((np.any(parts, axis=0) & ~table.validation)[chosen].sum())
+        parts = [table.training(episodes) for (_, episodes), equal in zip(learnt, same, strict=True) if equal]
+        return int(np.any(parts, axis=0)[chosen].sum())
     digests = (digest for root, episodes in learnt for digest in learnt_digests(Path(root), episodes))
     return len(action_digests(table, chosen) & {*digests})
 
@@ -199,7 +200,7 @@ def learnt_digests(root: Path, episodes: Sequence[int] | None) -> set[str]:
         table = read_episodes(open_dataset(root))
     except FieldError:
         return set()
-    return action_digests(table, np.flatnonzero(table.among(episodes) & ~table.validation))
+    return action_digests(table, np.flatnonzero(table.training(episodes)))
 
 
 def action_digests(table: EpisodeTable, episodes: np.ndarray) -> set[str]:
@@ -215,7 +216,7 @@ def _trainings(checkpoint: str, trained: str) -> Iterator[tuple[str, Mapping[str
     visited = set()
     while checkpoint and checkpoint not in visited:
         visited.add(checkpoint)
-        settings = stored_settings(resolve_checkpoint(checkpoint) / CONFIG_FILE)
+        settings = stored_settings(model_folder(checkpoint) / CONFIG_FILE)
         yield checkpoint, settings
         checkpoint = str((settings.get(trained) or {}).get("pretrained_path") or "")
 
@@ -233,7 +234,7 @@ def same_training(one: str, other: str) -> bool:
 
 def training_folder(checkpoint: str) -> Path:
     """Return the output folder of the training that made a checkpoint, or the checkpoint itself."""
-    folder = resolve_checkpoint(checkpoint).resolve()
+    folder = model_folder(checkpoint).resolve()
     folder = folder.parent if folder.name == PRETRAINED_MODEL_DIR else folder
     return folder.parents[1] if folder.parent.name == CHECKPOINTS_DIR else folder
 

@@ -2,10 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final
-
-from matplotlib.figure import Figure
 
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation.calibration import (
@@ -153,23 +150,3 @@ def confusion_json(confusion: Confusion) -> dict[str, Any]:
         "recall": confusion.recall.as_json(),
         "false_positive_rate": confusion.false_positives.as_json(),
     }
-
-
-def save_picture(judgement: Judgement, path: Path) -> None:
-    """Draw the estimates with their intervals, and imagined and known real success as points."""
-    figure = Figure(figsize=(7, 1.4 + 0.5 * len(judgement.outcomes)), layout="constrained")
-    axes = figure.subplots()
-    for place, name in enumerate(judgement.outcomes):
-        estimate = judgement.estimate(name)
-        if estimate is not None:
-            whiskers = [[estimate.value - estimate.low], [estimate.high - estimate.value]]
-            axes.errorbar(estimate.value, place, xerr=whiskers, color="#2b6cb0", marker="o", capsize=4)
-        axes.plot(judgement.imagined(name).share, place, color="#999", marker="|", markersize=12)
-        if name in judgement.references:
-            axes.plot(judgement.references[name].share, place, color="#c05621", marker="x")
-    axes.set_yticks(range(len(judgement.outcomes)), list(judgement.outcomes))
-    axes.invert_yaxis()
-    axes.set_xlim(0, 1)
-    axes.set_xlabel("success rate: estimated (blue), imagined (grey), known (orange)")
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=130)

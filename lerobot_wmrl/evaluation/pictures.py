@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: recorded beside imagined frames, goal frames, and measures by step."""
+"""Pictures of evaluations: recorded beside imagined frames, goal frames, measures by step, success rates."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,8 +12,10 @@ from lerobot_wmrl.common.frame_strips import GAP, enlarged, in_a_row
 from lerobot_wmrl.common.images import to_pixels
 from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.evaluation.agreement import Agreement
+from lerobot_wmrl.evaluation.comparison import Comparison
 from lerobot_wmrl.evaluation.gate import SWEEP_FRAMES, SWEEP_THRESHOLDS, Gate
 from lerobot_wmrl.evaluation.goals import Goals
+from lerobot_wmrl.evaluation.judgement import Judgement
 from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
@@ -154,3 +156,39 @@ def save_agreement(agreement: Agreement, path: Path) -> None:
 def _save(figure: Figure, path: Path) -> None:
     figure.tight_layout()
     figure.savefig(path, dpi=110)
+
+
+def save_comparison(comparison: Comparison, path: Path) -> None:
+    """Draw the success rates with their 95 % intervals."""
+    rates = comparison.rates()
+    figure = Figure(figsize=(7, 1.2 + 0.5 * len(rates)), layout="constrained")
+    axes = figure.subplots()
+    for place, rate in enumerate(rates.values()):
+        axes.barh(place, rate.share, 0.6, color="#2b6cb0")
+        axes.errorbar(rate.share, place, xerr=rate.whiskers, color="#333", capsize=4)
+    axes.set_yticks(range(len(rates)), list(rates))
+    axes.invert_yaxis()
+    axes.set_xlim(0, 1)
+    axes.set_xlabel(f"success rate over {len(comparison.episodes)} starts, with 95 % intervals")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=130)
+
+
+def save_judgement(judgement: Judgement, path: Path) -> None:
+    """Draw the estimates with their intervals, and imagined and known real success as points."""
+    figure = Figure(figsize=(7, 1.4 + 0.5 * len(judgement.outcomes)), layout="constrained")
+    axes = figure.subplots()
+    for place, name in enumerate(judgement.outcomes):
+        estimate = judgement.estimate(name)
+        if estimate is not None:
+            whiskers = [[estimate.value - estimate.low], [estimate.high - estimate.value]]
+            axes.errorbar(estimate.value, place, xerr=whiskers, color="#2b6cb0", marker="o", capsize=4)
+        axes.plot(judgement.imagined(name).share, place, color="#999", marker="|", markersize=12)
+        if name in judgement.references:
+            axes.plot(judgement.references[name].share, place, color="#c05621", marker="x")
+    axes.set_yticks(range(len(judgement.outcomes)), list(judgement.outcomes))
+    axes.invert_yaxis()
+    axes.set_xlim(0, 1)
+    axes.set_xlabel("success rate: estimated (blue), imagined (grey), known (orange)")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=130)

@@ -1,7 +1,10 @@
-"""Policies run in environments by LeRobot's evaluation: from the same starts, with the same dice."""
+"""Policies run in environments by LeRobot's evaluation: from the same starts, with the same dice, until it is
+decided who is better."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from math import ceil
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -10,7 +13,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
-from lerobot.envs.utils import env_to_policy_features
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
 from lerobot.scripts.lerobot_eval import eval_policy
 from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import seeded_context
@@ -26,22 +29,22 @@ from lerobot_wmrl.common.policies import (
 )
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
-from lerobot_wmrl.envs.lerobot_env import freeze_finished, is_own, runs_in_processes
-from lerobot_wmrl.evaluation.comparison import Episode
+from lerobot_wmrl.envs.lerobot_env import counts_resets, freeze_finished, is_own, runs_in_processes
+from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 from lerobot_wmrl.world_models.checkpoint import load_model
 
 type Envs = dict[str, dict[int, gym.vector.VectorEnv]]
 """Suite → task → vector environment, as LeRobot's make_env returns them."""
 
 
-type Outcomes = dict[tuple[str, int, int], bool]
+type SuccessByStart = dict[tuple[str, int, int], bool]
 """Success of each episode by its suite, task and seed."""
 
 
-class Evaluated(NamedTuple):
+class PolicyEvaluation(NamedTuple):
     """Success of each episode, and the steps of all of them together."""
 
-    outcomes: Outcomes
+    outcomes: SuccessByStart
     steps: int
 
     @property
@@ -143,7 +146,9 @@ def flat(envs: Envs) -> list[Any]:
 
 
 @torch.no_grad()
-def run_policy(envs: Envs, config: EnvConfig, policy: LoadedPolicy, episodes: int, seed: int) -> Evaluated:
+def run_policy(
+    envs: Envs, config: EnvConfig, policy: LoadedPolicy, episodes: int, seed: int
+) -> PolicyEvaluation:
     """Run LeRobot's evaluation of a policy in every task of open environments.
 
     Args:
@@ -152,7 +157,7 @@ def run_policy(envs: Envs, config: EnvConfig, policy: LoadedPolicy, episodes: in
             a policy that draws its actions.
     """
     processors = *make_env_pre_post_processors(config, policy.config), *policy.processors
-    outcomes: Outcomes = {}
+    outcomes: SuccessByStart = {}
     steps = 0
     with seeded_context(seed):
         for suite, tasks in envs.items():
@@ -163,7 +168,7 @@ def run_policy(envs: Envs, config: EnvConfig, policy: LoadedPolicy, episodes: in
                 )["per_episode"]  # fmt: skip
                 outcomes |= {(suite, task, each["seed"]): bool(each["success"]) for each in results}
                 steps += counted.steps
-    return Evaluated(outcomes, steps)
+    return PolicyEvaluation(outcomes, steps)
 
 
 def run_block(
@@ -179,10 +184,10 @@ def run_block(
 
 def evaluate_policy(
     config: EnvConfig, policy: LoadedPolicy, episodes: int, seed: int, num_envs: int
-) -> Evaluated:
+) -> PolicyEvaluation:
     """Run a policy in `num_envs` environments of each task, which are closed before those of the next."""
     envs: Envs = make_env(config, min(num_envs, episodes), runs_in_processes(config))
-    outcomes: Outcomes = {}
+    outcomes: SuccessByStart = {}
     steps = 0
     for suite, tasks in envs.items():
         for task, env in tasks.items():
@@ -191,12 +196,12 @@ def evaluate_policy(
                 evaluated = run_policy({suite: {task: env}}, config, policy, episodes, seed)
             outcomes |= evaluated.outcomes
             steps += evaluated.steps
-    return Evaluated(outcomes, steps)
+    return PolicyEvaluation(outcomes, steps)
 
 
 def evaluate_within(
     env: gym.vector.VectorEnv, config: EnvConfig, policy: LoadedPolicy, episodes: int, seed: int
-) -> Evaluated:
+) -> PolicyEvaluation:
     """Run a policy in an existing tensor environment of this configuration, which stays open."""
     return run_policy({config.type: {0: EvaluationAdapter(env)}}, config, policy, episodes, seed)
 
@@ -224,3 +229,54 @@ class StepCounter:
         result: tuple[Any, ...] = self.env.step(actions)
         self._running &= ~(result[2] | result[3])
         return result
+
+
+def require_new_starts(envs: Envs, config: EnvConfig, n_episodes: int) -> None:
+    """Raise FieldError if a world model or LIBERO has too few starts: some would count twice."""
+    if isinstance(config, WorldModelEnv):
+        fewest = min(len(env.env.starts) for env in flat(envs))
+        problem, more = "the world model has {} start frames", ", or give more with `env.dataset.max_starts`"
+    elif counts_resets(config):
+        fewest = min(len(states) for env in flat(envs) for states in env.call("_init_states"))
+        problem, more = f"{config.type} has {{}} starts", ", or set `env.init_states` to false"
+    else:
+        return
+    if n_episodes > fewest:
+        raise FieldError(
+            "n_episodes", n_episodes,
+            f"{problem.format(fewest)} for a task, and an episode that is repeated says nothing new",
+            f"set it to at most {fewest}{more}",
+        )  # fmt: skip
+
+
+def run_comparison(
+    comparison: Comparison, envs: Sequence[Envs], config: EnvConfig, policies: Sequence[LoadedPolicy],
+    batch_size: int, seed: int, save: Callable[[], None],
+) -> None:  # fmt: skip
+    """Add blocks of `batch_size` starts of each task until the comparison is finished.
+
+    Args:
+        envs: those of each policy.
+        seed: seed of the first start of each task; each further one adds one.
+        save: called after every block.
+
+    Raises:
+        FieldError: LIBERO has skipped starts, since an earlier call ended within a batch.
+    """
+    if counts_resets(config) and not comparison.finished:
+        if comparison.starts_per_task % batch_size:
+            raise FieldError(
+                "n_episodes", comparison.n_episodes,
+                f"the {comparison.starts_per_task} starts so far end within a batch of {batch_size}, after "
+                f"which {config.type} skips some", "choose a new `output_dir`",
+            )  # fmt: skip
+        for env in (each for policy_envs in envs for each in flat(policy_envs)):
+            for _ in range(ceil(comparison.starts_per_task / batch_size)):
+                env.reset(options={NEW_ROLLOUT_OPTION: True})
+    while not comparison.finished:
+        done = comparison.starts_per_task
+        count = min(batch_size, comparison.n_episodes - done)
+        comparison.episodes.extend(run_block(envs, config, policies, count, seed + done))
+        save()
+        shares = (f"{name} {rate.share:.0%}" for name, rate in comparison.rates().items())
+        logging.info("%d starts: %s", len(comparison.episodes), ", ".join(shares))

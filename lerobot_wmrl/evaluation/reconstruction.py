@@ -82,7 +82,7 @@ def reconstruct(
     model: TokenizingModel, frames: np.ndarray, rows: np.ndarray, starts: np.ndarray
 ) -> Reconstruction:
     """Encode and decode the frames `rows` (R,) of episodes that began at the rows `starts` (R,)."""
-    device, parts = next(model.tokenizer.parameters()).device, []
+    device, parts = model.tokenizer.device, []
     for begin in trange(0, len(rows), BATCH, desc="Reconstructing frames", unit="batch"):
         part = slice(begin, begin + BATCH)
         recorded, start = (frames_to_tensor(frames[index[part]]).to(device) for index in (rows, starts))

@@ -61,7 +61,7 @@ class Recording:
     @torch.no_grad()
     def first_frames(self, episodes: np.ndarray, tokenizer: FrameTokenizer) -> tuple[Tensor, Context]:
         """Encode the first frames of E episodes: tokens (E, S), and their context."""
-        device = next(tokenizer.parameters()).device
+        device = tokenizer.device
         images = frames_to_tensor(self.frames[self.table.start[episodes]]).to(device)
         context = tokenizer.context(images)
         return tokenizer.encode(images, context), context
@@ -74,7 +74,7 @@ class Recording:
         instructions = [self.table.instructions[episode] for episode in episodes]
         return Frames(
             tokens, state, context, model.recorded_depth(self.table.dataset, rows),
-            model.success_weights(instructions, len(episodes)),
+            model.instruction_weights(instructions, len(episodes)),
         )  # fmt: skip
 
     def actions(self, episodes: np.ndarray, steps: int, device: torch.device) -> Tensor:
@@ -165,7 +165,7 @@ def replay_episodes(
 def _replay_batch(
     model: ActionWorldModelRewardModel, recording: Recording, episodes: np.ndarray, previous: np.ndarray
 ) -> Iterator[EpisodeReplay]:
-    device, table = model.state_mean.device, recording.table
+    device, table = model.device, recording.table
     longest, until = int(table.length[episodes].max()), recording.steps(DELTA_PSNR_SECONDS)
     frames = recording.starts(model, episodes)
     actions = recording.actions(episodes, longest, device)

@@ -29,17 +29,15 @@ from lerobot_wmrl.evaluation.gate import (
     SWEEP_FRAMES,
     SWEEP_THRESHOLDS,
     Gate,
-    Outcomes,
     best_operating_point,
-    by_task,
     done_accuracy,
     gate_at,
     gate_details,
-    seen_outcomes,
     sweep,
 )
 from lerobot_wmrl.evaluation.goals import GoalQuality, goal_quality, imagine_goals
 from lerobot_wmrl.evaluation.image_metrics import cached_lpips
+from lerobot_wmrl.evaluation.outcomes import Outcomes, by_task, seen_outcomes
 from lerobot_wmrl.evaluation.replay import COMPARED_FRAMES, EpisodeReplay, Recording, replay_episodes
 from lerobot_wmrl.evaluation.success_probe import train_probe
 from lerobot_wmrl.world_models.modeling_world_model import (
@@ -94,7 +92,7 @@ TITLES = {
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class ReplayEvaluation:
     """Measures of one pass over recorded episodes.
 
     Args:
@@ -120,7 +118,7 @@ class Report(NamedTuple):
 def evaluate(
     model: ActionWorldModelRewardModel, recording: Recording, episodes: np.ndarray,
     episode_length: int | None = None,
-) -> Evaluation:  # fmt: skip
+) -> ReplayEvaluation:  # fmt: skip
     """Replay and measure the episodes, keeping the measures and only two replays' frames.
 
     Args:
@@ -138,7 +136,7 @@ def evaluate(
             "every chosen episode has a single frame: there is nothing to predict",
             "use a dataset with longer episodes",
         )  # fmt: skip
-    lpips = cached_lpips(model.state_mean.device)
+    lpips = cached_lpips(model.device)
     accuracy, replays = [], []
     shown: dict[str, EpisodeReplay] = {}
     for run in replay_episodes(model, recording, episodes):
@@ -149,11 +147,11 @@ def evaluate(
     accuracy.sort(key=lambda each: each.episode)
     outcomes = Outcomes.stack(replays).attempts(recording.table).within(episode_length)
     known = outcomes.where(np.full(len(outcomes.episodes), recording.table.done_known))
-    return Evaluation(accuracy, outcomes.episodes, known, shown)
+    return ReplayEvaluation(accuracy, outcomes.episodes, known, shown)
 
 
 def report_action_model(
-    model: ActionWorldModelRewardModel, recording: Recording, evaluation: Evaluation,
+    model: ActionWorldModelRewardModel, recording: Recording, evaluation: ReplayEvaluation,
     threshold: float, frames: int, folder: Path,
 ) -> Report:  # fmt: skip
     """Report accuracy, done, gate and robustness, and save their pictures in `folder`."""
@@ -209,7 +207,7 @@ def report_action_model(
 
 
 def report_goals(
-    text_model: TextWorldModelRewardModel, recording: Recording, evaluation: Evaluation, folder: Path
+    text_model: TextWorldModelRewardModel, recording: Recording, evaluation: ReplayEvaluation, folder: Path
 ) -> Report:
     """Report goal frames from the starts of the evaluated episodes, and save goal_frames.png in `folder`."""
     attempts = evaluation.attempts

@@ -7,7 +7,7 @@ import torch
 
 from lerobot_wmrl.common.images import to_pixels
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
-from lerobot_wmrl.evaluation.gate import first_run
+from lerobot_wmrl.evaluation.outcomes import first_run
 from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import general_reward, potential_discount

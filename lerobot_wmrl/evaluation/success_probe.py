@@ -147,7 +147,7 @@ def decoded(tokenizer: FrameTokenizer, frames: np.ndarray, rows: np.ndarray, sta
 
     starts (R,): the first rows of their episodes.
     """
-    device, parts = next(tokenizer.parameters()).device, []
+    device, parts = tokenizer.device, []
     for begin in range(0, len(rows), ENCODE_BATCH):
         part = slice(begin, begin + ENCODE_BATCH)
         images, first = (frames_to_tensor(frames[which[part]]).to(device) for which in (rows, starts))

@@ -10,7 +10,7 @@ import torch
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD
 
-from lerobot_wmrl.common.checkpoints import best_checkpoint, last_checkpoint, resolved_path
+from lerobot_wmrl.common.checkpoints import best_model, last_model, resolved_path
 from lerobot_wmrl.common.constants import START_KIND, START_SEED
 from lerobot_wmrl.common.policies import check_units, copy_checkpoint, load_processors
 from lerobot_wmrl.common.presets import Flags
@@ -134,7 +134,7 @@ class Plan:
     def rl_checkpoint(self) -> Path:
         """RL's checkpoint: the best one with selection, else the last. It exists too if RL stopped early."""
         folder = self.out / "rl"
-        return best_checkpoint(folder) if self.config.selects else last_checkpoint(folder)
+        return best_model(folder) if self.config.selects else last_model(folder)
 
     @property
     def rl_selection_episodes(self) -> int:

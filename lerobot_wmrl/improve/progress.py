@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
-from lerobot_wmrl.common.checkpoints import last_checkpoint
+from lerobot_wmrl.common.checkpoints import last_model
 from lerobot_wmrl.common.presets import Flags
 from lerobot_wmrl.common.stages import FAILED, read_record
 from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy, most_successful
@@ -54,13 +54,13 @@ class Progress:
         plan = self.plan
         trained = {SFT: plan.policy}
         if plan.clones:
-            trained[CLONED] = str(last_checkpoint(plan.out / "cloned"))
+            trained[CLONED] = str(last_model(plan.out / "cloned"))
         has_others = plan.clones or self.has_distilled
         if changed := self.has_trained and not (self.kept_start and has_others):  # else it is one of them
             fitted = plan.config.algorithm["algorithm.type"] == "distillation"
             trained[FITTED if fitted else PPO] = str(plan.rl_checkpoint)
         if self.has_distilled:
-            trained[DISTILLED if changed else FITTED] = str(last_checkpoint(plan.out / "distilled"))
+            trained[DISTILLED if changed else FITTED] = str(last_model(plan.out / "distilled"))
         return trained
 
     def chosen(self) -> str:

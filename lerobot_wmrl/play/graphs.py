@@ -122,7 +122,7 @@ class ReadStart(Graph):
         if BYTES in tensors:
             classifier: Any = tokenizer.success
             ids = tensors[BYTES]
-            read["success_weights"] = classifier.instructions.weights(ids, (ids != 0).long())
+            read["instruction_weights"] = classifier.instructions.weights(ids, (ids != 0).long())
         return {"codes": codes, "state": state, **numbered("context", context.maps), **read}
 
 
@@ -150,17 +150,17 @@ class ImagineStep(Graph):
 
     def __init__(self, model: ActionWorldModelRewardModel, contexts: int) -> None:
         maps = [f"context_{index}" for index in range(1, contexts)]
-        read = ["success_weights"] if model.config.reads_instructions else []
+        read = ["instruction_weights"] if model.config.reads_instructions else []
         super().__init__(model, ["action", "age", *SCENE, *ROLLOUT, "keys", "values", *maps, *read])
 
     def compute(self, tensors: Tensors) -> Tensors:
         network, codebook = self.network, self.network.codebook
         memory = WrittenMemory(tensors["keys"], tensors["values"], tensors["age"])
-        condition = self.model.encode_actions(tensors["action"][:, None], tensors.get("success_weights"))
+        condition = self.model.encode_actions(tensors["action"][:, None], tensors.get("instruction_weights"))
         scene = EncodedScene(*(tensors[name] for name in SCENE))
         rollout = StateRollout(*(tensors[name] for name in ROLLOUT))
         prediction, rollout = network.follow(
-            scene, rollout, condition.mean(), memory, None, condition.success_weights
+            scene, rollout, condition.mean(), memory, None, condition.instruction_weights
         )
         codes = codebook.most_likely(prediction.logits)
         maps = [tensors[name] for name in self.reads if name.startswith("context")]

@@ -10,7 +10,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.rewards.factory import make_reward_model
 from tqdm import tqdm
 
-from lerobot_wmrl.common.checkpoints import local_checkpoint
+from lerobot_wmrl.common.checkpoints import local_model_folder
 from lerobot_wmrl.common.errors import FieldError, first_line, renamed
 from lerobot_wmrl.data.dataset import VIDEO_BACKEND
 from lerobot_wmrl.rewards.loading import load_preprocessor
@@ -36,7 +36,7 @@ def frame_rewards(path: str, device: str | None, dataset: LeRobotDataset) -> np.
         FieldError: there is no such model, or it does not fit the dataset.
     """
     try:
-        folder = local_checkpoint(path)
+        folder = local_model_folder(path)
         config = RewardModelConfig.from_pretrained(folder)
     except Exception as error:  # a missing file, a type that nobody registered, or what the hub answers
         raise FieldError(

@@ -12,7 +12,7 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
-from lerobot_wmrl.common.checkpoints import local_checkpoint
+from lerobot_wmrl.common.checkpoints import local_model_folder
 from lerobot_wmrl.common.constants import INSTRUCTIONS
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig, LearnedRewardConfig
@@ -40,7 +40,7 @@ def load_reward(config: RewardModelConfig, model: ActionWorldModelRewardModel, l
     Raises:
         FieldError: the reward does not fit the world model, or has to be trained first.
     """
-    device = model.state_mean.device.type
+    device = model.device.type
     if isinstance(config, GeneralConfig):
         return make_reward_model(replace(config, gamma=potential_discount(config, longest)))
     if not isinstance(config, LearnedRewardConfig):
@@ -83,7 +83,7 @@ def load_lerobot_reward(config: RewardModelConfig, cameras: list[str], device: s
     if config.pretrained_path:
         path = config.pretrained_path
         config = read_config(path, config.type, device)
-        config.pretrained_path = str(local_checkpoint(path))
+        config.pretrained_path = str(local_model_folder(path))
     check_observation(config, cameras)
     return LeRobotReward(make_reward_model(config), load_preprocessor(config))
 

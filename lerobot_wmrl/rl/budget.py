@@ -58,8 +58,8 @@ def check_rounds(settings: CallbackSettings, env: WorldModelEnv) -> None:
                 table = read_episodes(source.open())
                 check_dataset(config, table.dataset.meta)
                 remedy = f"give a dataset without them as `{field}`"
-                learnt = table.among(getattr(source, "episodes", None)) & ~table.validation
-                require_unreported(table, np.flatnonzero(learnt), remedy)
+                learnt = np.flatnonzero(table.training(getattr(source, "episodes", None)))
+                require_unreported(table, learnt, remedy)
 
 
 def charge_steps(budget: Path, output_dir: Path, steps: int, episode_length: int) -> None:

@@ -1,8 +1,10 @@
-"""Configuration of PPO, `algorithm.type` ppo, and the options that it shares with GRPO."""
+"""What every algorithm's configuration says; PPO, `algorithm.type` ppo, and what it shares with GRPO."""
 
+import logging
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
+from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
 from lerobot_wmrl.common.errors import require_at_least, require_choice, require_positive, require_share
@@ -10,7 +12,28 @@ from lerobot_wmrl.rewards.general import default_discount
 
 
 @dataclass
-class PolicyGradientConfig(RLAlgorithmConfig):
+class AlgorithmConfig(RLAlgorithmConfig):
+    """What a training asks of every algorithm."""
+
+    compares_starts: ClassVar[bool] = False
+    """Whether episodes from the same start are compared with each other."""
+
+    @classmethod
+    def from_policy_config(cls, policy_cfg: Any) -> Self:
+        """Return the defaults, which depend on no policy."""
+        return cls()
+
+    def check(self, num_envs: int, iterations: int, env: EnvConfig) -> None:
+        """Raise FieldError if it cannot train in so many environments; warn if it would learn nothing."""
+
+    def discount(self, longest: int) -> float | None:
+        """Return the discount factor of rewards in episodes of up to `longest` steps, None if it learns from
+        no reward."""
+        return None
+
+
+@dataclass
+class PolicyGradientConfig(AlgorithmConfig):
     """Options that PPO and GRPO share: ascent on a clipped objective, several epochs a rollout.
 
     Args:
@@ -57,11 +80,6 @@ class PolicyGradientConfig(RLAlgorithmConfig):
         if self.initial_std is not None:
             require_positive(self, "initial_std")
 
-    @classmethod
-    def from_policy_config(cls, policy_cfg: Any) -> Self:
-        """Return the defaults, which depend on no policy."""
-        return cls()
-
 
 @RLAlgorithmConfig.register_subclass("ppo")
 @dataclass
@@ -95,6 +113,14 @@ class PPOConfig(PolicyGradientConfig):
             require_positive(self, "gamma")
             require_share(self, "gamma")
 
+    def check(self, num_envs: int, iterations: int, env: EnvConfig) -> None:
+        """Warn if the value function alone would learn."""
+        if self.value_iterations >= iterations:
+            logging.warning(
+                "iterations=%d: the policy stays as it is, because the value function alone learns in the "
+                "first %d (algorithm.value_iterations)", iterations, self.value_iterations,
+            )  # fmt: skip
+
     def discount(self, longest: int) -> float:
-        """Return the discount factor for episodes of up to `longest` steps."""
+        """Return the discount factor of rewards in episodes of up to `longest` steps."""
         return default_discount(longest) if self.gamma is None else self.gamma

@@ -1,11 +1,13 @@
 """Configuration of distillation, `algorithm.type` distillation."""
 
 from dataclasses import dataclass, field
-from typing import Any, Self
 
+from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
-from lerobot_wmrl.common.errors import require_at_least, within
+from lerobot_wmrl.common.errors import FieldError, require_at_least, within
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.rl.configuration_algorithms import AlgorithmConfig
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 
 
@@ -16,7 +18,7 @@ def fast_planner() -> PlannerSettings:
 
 @RLAlgorithmConfig.register_subclass("distillation")
 @dataclass
-class DistillationConfig(RLAlgorithmConfig):
+class DistillationConfig(AlgorithmConfig):
     """Distillation of a planner into the policy, in imagination (DAgger, Ross et al. 2011).
 
     The policy acts first, then the planner takes over. The policy is fitted, by its own supervised loss, to
@@ -47,7 +49,16 @@ class DistillationConfig(RLAlgorithmConfig):
         require_at_least(self, 0, "longest_lead", "updates", "last_updates")
         require_at_least(self, 1, "batch_size")
 
-    @classmethod
-    def from_policy_config(cls, policy_cfg: Any) -> Self:
-        """Return the defaults, which depend on no policy."""
-        return cls()
+    def check(self, num_envs: int, iterations: int, env: EnvConfig) -> None:
+        """Raise FieldError unless the planner can look ahead in the environment."""
+        if not isinstance(env, WorldModelEnv):
+            raise FieldError(
+                "algorithm.type", "distillation",
+                f"its planner looks ahead in a world model, and `env.type` is {env.type}",
+                "set `env.type` to world_model, or choose ppo or grpo",
+            )  # fmt: skip
+        if env.done_frames > self.planner.horizon:
+            raise FieldError(
+                "algorithm.planner.horizon", self.planner.horizon,
+                f"must be at least `env.done_frames`, {env.done_frames}",
+            )  # fmt: skip

@@ -1,7 +1,9 @@
 """Configuration of GRPO, `algorithm.type` grpo."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
+from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_positive, require_share
@@ -23,6 +25,8 @@ class GRPOConfig(PolicyGradientConfig):
         reference_coefficient: weight of the KL penalty towards the SFT policy; GRPO needs none.
     """
 
+    compares_starts: ClassVar[bool] = True
+
     group_size: int = 8
     clip_low: float = 0.2
     clip_high: float = 0.28
@@ -35,7 +39,7 @@ class GRPOConfig(PolicyGradientConfig):
         require_share(self, "clip_low", "clip_high")
         require_at_least(self, 2, "group_size")
 
-    def check_num_envs(self, num_envs: int) -> None:
+    def check(self, num_envs: int, iterations: int, env: EnvConfig) -> None:
         """Raise FieldError unless the environments can be divided into groups."""
         if num_envs % self.group_size:
             raise FieldError(
@@ -43,3 +47,7 @@ class GRPOConfig(PolicyGradientConfig):
                 f"must be a multiple of `algorithm.group_size={self.group_size}`, the environments that "
                 "start from the same state",
             )  # fmt: skip
+
+    def discount(self, longest: int) -> float:
+        """Return 1: the rewards of an episode are added up."""
+        return 1.0

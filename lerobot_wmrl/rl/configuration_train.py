@@ -1,6 +1,5 @@
 """Configuration of lerobot-wmrl-train."""
 
-import logging
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar
@@ -14,11 +13,8 @@ from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, within
-from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig, PPOConfig
+from lerobot_wmrl.rl.configuration_algorithms import AlgorithmConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
-from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
-from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 
 PUBLISHING = ("push_to_hub", "repo_id", "private", "license", "tags")
 """Settings of the policy that only matter when it is published."""
@@ -96,42 +92,19 @@ class TrainConfig(CallbackSettings, RunConfig):
 
     def validate(self) -> None:
         """Raise FieldError for the first setting that is impossible."""
-        if not isinstance(self.algorithm, PolicyGradientConfig | DistillationConfig):
+        if not isinstance(self.algorithm, AlgorithmConfig):
             raise FieldError(
                 "algorithm.type", self.algorithm.type, "this command trains with ppo, grpo or distillation"
             )
         if self.env is None:
             raise FieldError("env.type", None, "is missing", "choose world_model, or another environment")
         require_at_least(self, 1, "num_envs", "iterations", "save_freq", "log_freq")
-        if isinstance(self.algorithm, PPOConfig) and self.algorithm.value_iterations >= self.iterations:
-            logging.warning(
-                "iterations=%d: the policy stays as it is, because the value function alone learns in the "
-                "first %d (algorithm.value_iterations)", self.iterations, self.algorithm.value_iterations,
-            )  # fmt: skip
-        if isinstance(self.algorithm, GRPOConfig):
-            self.algorithm.check_num_envs(self.num_envs)
-        if isinstance(self.algorithm, DistillationConfig):
-            check_distillation(self.algorithm, self.env)
+        self.algorithm.check(self.num_envs, self.iterations, self.env)
         if not 0 <= self.seed < EVALUATION_SEED:
             raise FieldError(
                 "seed", self.seed, f"must be from 0 to {EVALUATION_SEED - 1}; those above are for evaluation"
             )
         self.check_callbacks(self.env, self.iterations)
-
-
-def check_distillation(algorithm: DistillationConfig, env: EnvConfig) -> None:
-    """Raise FieldError unless the planner can look ahead in the environment."""
-    if not isinstance(env, WorldModelEnv):
-        raise FieldError(
-            "algorithm.type", "distillation",
-            f"its planner looks ahead in a world model, and `env.type` is {env.type}",
-            "set `env.type` to world_model, or choose ppo or grpo",
-        )  # fmt: skip
-    if env.done_frames > algorithm.planner.horizon:
-        raise FieldError(
-            "algorithm.planner.horizon", algorithm.planner.horizon,
-            f"must be at least `env.done_frames`, {env.done_frames}",
-        )  # fmt: skip
 
 
 def load_config(cfg: TrainConfig) -> PreTrainedConfig:

@@ -20,7 +20,8 @@ from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.evaluation.evidence import LabelledRollouts, learnt_from
-from lerobot_wmrl.evaluation.gate import Gate, Outcomes, gate_at, labelled_recording, predict_outcomes
+from lerobot_wmrl.evaluation.gate import Gate, gate_at
+from lerobot_wmrl.evaluation.outcomes import Outcomes, labelled_recording, predict_outcomes
 from lerobot_wmrl.evaluation.pictures import save_strip, side_by_side
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record

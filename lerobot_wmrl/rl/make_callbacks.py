@@ -10,10 +10,10 @@ from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.lerobot_env import is_own
-from lerobot_wmrl.envs.start_frames import Starts
+from lerobot_wmrl.envs.starts import Starts
 from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, load_spread_starts, make_success_env
-from lerobot_wmrl.evaluation.policy_rollouts import Evaluated, evaluate_policy, evaluate_within
+from lerobot_wmrl.evaluation.policy_rollouts import PolicyEvaluation, evaluate_policy, evaluate_within
 from lerobot_wmrl.rl.callbacks import Callback
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings, SelectionConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
@@ -97,6 +97,6 @@ def selection_starts(selection: SelectionConfig, env: WorldModelVectorEnv) -> St
 
 def measure_imagined(
     env: WorldModelVectorEnv, policy: LoadedPolicy, starts: Starts, episodes: int
-) -> Evaluated:
+) -> PolicyEvaluation:
     """Run a policy from these starts in the world model that `env` has by now."""
     return evaluate_within(make_success_env(env, starts), env.config, policy, episodes, SELECTION_SEED)

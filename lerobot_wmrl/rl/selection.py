@@ -8,12 +8,12 @@ from lerobot_wmrl.common.checkpoints import BEST_CHECKPOINT_LINK, checkpoint_dir
 from lerobot_wmrl.common.distributed import is_first_process
 from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.evaluation.policy_rollouts import Evaluated
+from lerobot_wmrl.evaluation.policy_rollouts import PolicyEvaluation
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record
 
 REAL, IMAGINED = "real", "imagined"
 
-Measure = Callable[[], Evaluated]
+Measure = Callable[[], PolicyEvaluation]
 """Plays episodes with the current policy, without exploration."""
 
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
-from lerobot_wmrl.common.checkpoints import best_checkpoint, last_checkpoint
+from lerobot_wmrl.common.checkpoints import best_model, last_model
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import within
 from lerobot_wmrl.common.presets import format_flags
@@ -41,7 +41,7 @@ It began as {start}. `train_config.json` has all settings. Evaluate it (FOLDER: 
 
 def chosen_checkpoint(cfg: TrainConfig) -> Path:
     """Return the best checkpoint, or the last one of a training without selection."""
-    model = best_checkpoint if cfg.selection.freq else last_checkpoint
+    model = best_model if cfg.selection.freq else last_model
     return model(cfg.output_dir).parent
 
 

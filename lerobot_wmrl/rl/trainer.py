@@ -12,7 +12,7 @@ from lerobot.utils.logging_utils import MetricsTracker
 from tqdm import tqdm
 
 from lerobot_wmrl.common.checkpoints import (
-    latest_checkpoint,
+    newest_checkpoint,
     read_weights,
     should_save_checkpoint,
 )
@@ -155,7 +155,7 @@ def save(
 
 def resume(algorithm: TrainableAlgorithm, output_dir: Path) -> Path | None:
     """Load the latest checkpoint in `output_dir`, if there is one, and return it."""
-    checkpoint = latest_checkpoint(output_dir)
+    checkpoint = newest_checkpoint(output_dir)
     if checkpoint is None:
         return None
     algorithm.iteration = load_training_state(checkpoint, algorithm.optimizer)

@@ -90,7 +90,8 @@ class CompareConfig(RunConfig):
 
 def compare(cfg: CompareConfig) -> None:
     """Run the policies, or what is missing of their episodes; write comparison.json and comparison.png."""
-    from lerobot_wmrl.evaluation.comparison import RESULTS, Comparison, save_picture
+    from lerobot_wmrl.evaluation.comparison import RESULTS, Comparison
+    from lerobot_wmrl.evaluation.pictures import save_comparison
     from lerobot_wmrl.evaluation.policy_rollouts import read_policies
 
     cfg.validate()
@@ -104,7 +105,7 @@ def compare(cfg: CompareConfig) -> None:
     )
     if not comparison.finished:
         run(cfg, claim, comparison, configs)
-    save_picture(comparison, cfg.output_dir / "comparison.png")
+    save_comparison(comparison, cfg.output_dir / "comparison.png")
     print(f"{comparison}\n{RESULTS} and comparison.png are in {cfg.output_dir}")
 
 
@@ -118,10 +119,10 @@ def named_content(cfg: CompareConfig) -> dict[str, str]:
 
 def stored_episodes(cfg: CompareConfig) -> "list[Episode]":
     """Return the episodes that have run before."""
-    from lerobot_wmrl.evaluation.comparison import RESULTS, read_episodes
+    from lerobot_wmrl.evaluation.comparison import RESULTS, episodes_from_json
 
     results = cfg.output_dir / RESULTS
-    return read_episodes(json.loads(results.read_text())) if results.is_file() else []
+    return episodes_from_json(json.loads(results.read_text())) if results.is_file() else []
 
 
 def may_differ(cfg: CompareConfig) -> list[str]:
@@ -134,9 +135,13 @@ def run(
     cfg: CompareConfig, claim: Claim, comparison: "Comparison", configs: "dict[str, PreTrainedConfig]"
 ) -> None:
     """Run the episodes that are missing; write the results after every batch."""
-    from lerobot_wmrl.evaluation.compare import require_new_starts, run_comparison
     from lerobot_wmrl.evaluation.comparison import RESULTS
-    from lerobot_wmrl.evaluation.policy_rollouts import load_policies, opened
+    from lerobot_wmrl.evaluation.policy_rollouts import (
+        load_policies,
+        opened,
+        require_new_starts,
+        run_comparison,
+    )
 
     assert cfg.env is not None
 

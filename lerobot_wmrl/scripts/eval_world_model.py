@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from lerobot_wmrl.evaluation.agreement import Agreement
     from lerobot_wmrl.evaluation.evidence import LabelledRollouts
     from lerobot_wmrl.evaluation.replay import Recording
-    from lerobot_wmrl.evaluation.report import Evaluation, Report
+    from lerobot_wmrl.evaluation.report import ReplayEvaluation, Report
     from lerobot_wmrl.world_models.modeling_world_model import (
         ActionWorldModelRewardModel,
         TextWorldModelRewardModel,
@@ -345,7 +345,7 @@ def report_text_model(
     cfg: EvalWorldModelConfig,
     text_model: "TextWorldModelRewardModel",
     recording: "Recording",
-    evaluation: "Evaluation",
+    evaluation: "ReplayEvaluation",
     longest: int,
 ) -> "Report":
     """Report goal frames, and draw the reward along the shown episodes."""

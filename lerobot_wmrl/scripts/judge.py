@@ -160,7 +160,8 @@ def judge(cfg: JudgeConfig) -> None:
         replayed_rollouts,
         trained_inside,
     )
-    from lerobot_wmrl.evaluation.judgement import LEAST_YOUDEN, Judgement, confusion_sentence, save_picture
+    from lerobot_wmrl.evaluation.judgement import LEAST_YOUDEN, Judgement, confusion_sentence
+    from lerobot_wmrl.evaluation.pictures import save_judgement
 
     cfg.validate()
     cfg.world_model.path = resolved_name(cfg.world_model.path)
@@ -187,7 +188,7 @@ def judge(cfg: JudgeConfig) -> None:
     remember(judgement, cfg, configs)
     with writing("output_dir", cfg.output_dir):
         imagine(cfg, env, judgement, configs, len(rollouts.chosen), claim)
-        save_picture(judgement, cfg.output_dir / "judgement.png")
+        save_judgement(judgement, cfg.output_dir / "judgement.png")
     print(
         f"{judgement}\n\njudgement.json and judgement.png are in {cfg.output_dir}. Next: try the best in "
         "reality, and give the success that you count as --references"

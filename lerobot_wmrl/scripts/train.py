@@ -50,7 +50,7 @@ def train_policy(cfg: TrainConfig) -> None:
     from lerobot_wmrl.common.policies import require_distillable
     from lerobot_wmrl.envs.lerobot_env import make_tensor_env
     from lerobot_wmrl.rl.budget import check_data
-    from lerobot_wmrl.rl.fit import settle_discount
+    from lerobot_wmrl.rl.compatibility import settle_discount
 
     cfg.validate()
     settle_discount(cfg)
@@ -101,11 +101,11 @@ def named_content(cfg: TrainConfig, policy: PreTrainedConfig) -> dict[str, str]:
 
 def finished(cfg: TrainConfig) -> bool:
     """Return whether the run has reached its last iteration. FieldError if there is nothing to resume."""
-    from lerobot_wmrl.common.checkpoints import latest_checkpoint, require_resumable
+    from lerobot_wmrl.common.checkpoints import newest_checkpoint, require_resumable
     from lerobot_wmrl.rl.callbacks import has_record
     from lerobot_wmrl.rl.selection import Selection
 
-    last = latest_checkpoint(cfg.output_dir)
+    last = newest_checkpoint(cfg.output_dir)
     if cfg.resume:
         require_resumable(cfg.output_dir)
     if last is None or int(last.name) < cfg.iterations:
@@ -120,14 +120,14 @@ def train_in(env: TensorEnv, cfg: TrainConfig, claim: Claim, policy: LoadedPolic
     from lerobot_wmrl.common.pipeline import make_pipeline
     from lerobot_wmrl.common.policies import with_new_adapters
     from lerobot_wmrl.rl.budget import charge_steps
+    from lerobot_wmrl.rl.compatibility import match_policy_to_env, rollout_length
     from lerobot_wmrl.rl.distillation import Distillation
-    from lerobot_wmrl.rl.fit import fit, rollout_length
     from lerobot_wmrl.rl.make_callbacks import make_callbacks
     from lerobot_wmrl.rl.rollout import RolloutBuffer
     from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 
     config = policy.config
-    fit(cfg, policy, env)
+    match_policy_to_env(cfg, policy, env)
     if cfg.peft is not None:
         policy.policy = with_new_adapters(policy.policy, cfg.peft)
     algorithm = make_algorithm(policy.policy, cfg.algorithm, cfg.output_dir)

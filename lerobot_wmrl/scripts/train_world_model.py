@@ -132,11 +132,10 @@ def check_data(cfg: TrainWorldModelConfig, table: EpisodeTable) -> None:
     from lerobot_wmrl.maniskill.recordings import require_unreported
 
     def check_table(table: EpisodeTable, chosen: list[int] | None) -> None:
-        episodes = table.among(chosen).nonzero()[0]
-        learnt = episodes[~table.validation[episodes]]
+        learnt = table.training(chosen).nonzero()[0]
         require_unreported(table, learnt, "choose others with `dataset.episodes`")
         if cfg.budget is not None:
-            Ledger(cfg.budget).require_known(table, episodes)
+            Ledger(cfg.budget).require_known(table, table.among(chosen).nonzero()[0])
 
     check_table(table, cfg.dataset.episodes)
     with renamed("dataset.root", "dataset.more"):
@@ -148,7 +147,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     """Build or reload the model, train it, measure it on held-out episodes, publish it."""
     from lerobot.utils.random_utils import set_seed
 
-    from lerobot_wmrl.common.checkpoints import latest_checkpoint, link_latest, require_resumable
+    from lerobot_wmrl.common.checkpoints import link_latest, newest_checkpoint, require_resumable
     from lerobot_wmrl.data.episodes import read_episodes
     from lerobot_wmrl.world_models.checkpoint import config_to_continue
     from lerobot_wmrl.world_models.training import build_model, decide_on_instructions
@@ -166,7 +165,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     cfg.precision = precision_of(cfg)
     begun = deepcopy(cfg)  # the model fills in what it takes from the data
     claim = Claim(cfg.output_dir, draccus.encode(begun), MAY_DIFFER, fingerprints(cfg, table))
-    checkpoint = latest_checkpoint(cfg.output_dir)
+    checkpoint = newest_checkpoint(cfg.output_dir)
     set_seed(cfg.seed)
     claim.check()
     if is_first_process():
@@ -217,9 +216,9 @@ def run_training(
 
 def conclusion(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> str:
     """Measure the trained model and say what was made, how good it is and what comes next."""
-    from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+    from lerobot_wmrl.common.checkpoints import model_folder
 
-    size = sum(path.stat().st_size for path in resolve_checkpoint(cfg.output_dir).glob("*.safetensors"))
+    size = sum(path.stat().st_size for path in model_folder(cfg.output_dir).glob("*.safetensors"))
     parameters = sum(parameter.numel() for parameter in model.parameters())
     made = f"{parameters:,} parameters, {size / 1e6:.1f} MB"
     return (

@@ -13,7 +13,7 @@ from lerobot.rewards.factory import get_reward_model_class
 from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors import SafetensorError
 
-from lerobot_wmrl.common.checkpoints import UNPUBLISHED, resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import UNPUBLISHED, model_folder
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.data.checks import check_cameras, check_depth, check_widths
 from lerobot_wmrl.data.embodiment import check_same_robot
@@ -43,7 +43,7 @@ def read_config(
         FieldError: there is none, or it is of another type or of an earlier version of this package.
     """
     field = field or FIELDS.get(expected_type, "reward.pretrained_path")
-    folder = resolve_checkpoint(path)
+    folder = model_folder(path)
     if not (folder / "config.json").is_file():
         if folder.is_dir() or str(path).startswith((".", "/", "outputs")) or str(path).count("/") != 1:
             raise FieldError(
@@ -84,7 +84,7 @@ def config_to_continue(path: str, overrides: Sequence[str]) -> RewardModelConfig
 
     It is not published where that model was, unless they say so.
     """
-    folder = resolve_checkpoint(path)
+    folder = model_folder(path)
     revision = given_revision(overrides)
     try:
         RewardModelConfig.from_pretrained(str(folder), revision=revision)
@@ -165,7 +165,7 @@ def load_model(
         ValueError: not found, of another type or version, truncated, or with other tensors than its config.
     """
     config = read_config(path, expected_type, device, field)
-    folder = resolve_checkpoint(path)
+    folder = model_folder(path)
     try:
         model = get_reward_model_class(config.type).from_pretrained(str(folder), config=config, strict=True)
     except torch.OutOfMemoryError:

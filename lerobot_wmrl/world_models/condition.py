@@ -9,12 +9,13 @@ class Condition(NamedTuple):
     """The condition c of eq. 1.
 
     tokens (B, T or 1, M, D); mask (B, 1, 1, 1, M), True for the tokens that count, None if all do;
-    success_weights (B, 1, E), by which the instruction lets success be read, None unless the model reads it.
+    instruction_weights (B, 1, E), by which the instruction lets success be read, None unless the model reads
+    it.
     """
 
     tokens: Tensor
     mask: Tensor | None = None
-    success_weights: Tensor | None = None
+    instruction_weights: Tensor | None = None
 
     def mean(self) -> Tensor:
         """Mean of the tokens that count. → (B, T or 1, D)"""

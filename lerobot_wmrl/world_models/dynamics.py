@@ -48,8 +48,8 @@ class Imagination:
     """State of B imaginations: their newest frames, and the keys and values of the frames before.
 
     codes (B, 1, S, C) and state (B, 1, P), normalised, are of the newest frames; the context is that
-    of the frames where the imaginations began; success_weights (B, E) are those of their instructions, for
-    models that read them; the condition is set if it is the same at every step.
+    of the frames where the imaginations began; instruction_weights (B, E) are those of their instructions,
+    for models that read them; the condition is set if it is the same at every step.
     A step advances its tensors in place; that of autoregressive dynamics can be captured in a CUDA graph.
     """
 
@@ -57,7 +57,7 @@ class Imagination:
     state: Tensor
     cache: KVCache
     context: Context = NO_CONTEXT
-    success_weights: Tensor | None = None
+    instruction_weights: Tensor | None = None
     condition: Condition | None = None
 
     @property
@@ -118,16 +118,16 @@ class Dynamics(nn.Module):
         """Return the newest frames."""
         tokens = self.network.codebook.tokens(imagination.codes[:, 0])
         state = imagination.state[:, 0].clone()
-        return Frames(tokens, state, imagination.context, success_weights=imagination.success_weights)
+        return Frames(tokens, state, imagination.context, instruction_weights=imagination.instruction_weights)
 
     def restart(self, imagination: Imagination, mask: Tensor, frames: Frames) -> None:
         """Begin anew in the environments in `mask` (B,); frames are of all B."""
         self.show(imagination, mask, frames)
         imagination.context = imagination.context.replaced(mask, frames.context)
-        if imagination.success_weights is not None:
-            assert frames.success_weights is not None, "as where the imaginations began"
-            imagination.success_weights = torch.where(
-                mask[:, None], frames.success_weights, imagination.success_weights
+        if imagination.instruction_weights is not None:
+            assert frames.instruction_weights is not None, "as where the imaginations began"
+            imagination.instruction_weights = torch.where(
+                mask[:, None], frames.instruction_weights, imagination.instruction_weights
             )
         imagination.restart(mask)
 

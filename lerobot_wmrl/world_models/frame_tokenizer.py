@@ -61,6 +61,11 @@ class FrameTokenizer(nn.Module):
         self.success = SuccessClassifier(self.num_cameras, reads) if config.success else None
 
     @property
+    def device(self) -> torch.device:
+        """Where its weights are."""
+        return next(self.parameters()).device
+
+    @property
     def tokens_per_frame(self) -> int:
         """S, over all cameras."""
         return self.num_cameras * self.grid**2

@@ -34,12 +34,17 @@ class ImaginationMixin:
     state_mean: Tensor
     state_std: Tensor
 
+    @property
+    def device(self) -> torch.device:
+        """Where its weights are."""
+        return self.state_mean.device
+
     def recorded_depth(self, dataset: LeRobotDataset, rows: Any) -> Tensor | None:
         """Return the depth (…, S) in metres of rows of a dataset, None for a model without depth."""
         if not self.config.depth:
             return None
         depth = cached_depth(dataset, self.config.tokenizer.camera_keys, self.tokenizer.grid)[rows]
-        return torch.from_numpy(np.array(depth)).to(self.state_mean.device)
+        return torch.from_numpy(np.array(depth)).to(self.device)
 
     @torch.no_grad()
     def start(
@@ -54,7 +59,7 @@ class ImaginationMixin:
             dtype: what the network computes in, by default the fastest format; what is returned is float32.
         """
         if instructions is None:
-            self._require_success_weights(frames)
+            self._require_instruction_weights(frames)
         imagination = self.dynamics.start(self._normalized(frames), dtype)
         if instructions is not None:
             imagination.condition = self.encode_instructions(instructions, len(frames))
@@ -67,7 +72,7 @@ class ImaginationMixin:
             raise ValueError(
                 "restart: its instructions are those of the start; start a new imagination instead"
             )
-        self._require_success_weights(frames)
+        self._require_instruction_weights(frames)
         self.dynamics.restart(imagination, mask, self._normalized(frames))
 
     @torch.no_grad()
@@ -75,7 +80,7 @@ class ImaginationMixin:
         """Imagine the next frame of every environment: action (B, A) in the dataset's units."""
         condition = imagination.condition
         if action is not None:
-            condition = self.encode_actions(action[:, None], imagination.success_weights)
+            condition = self.encode_actions(action[:, None], imagination.instruction_weights)
         if condition is None:
             raise ValueError("this imagination needs an action each step, or an instruction at the start")
         imagined = self.dynamics.step(imagination, condition)
@@ -127,11 +132,11 @@ class ImaginationMixin:
         Anchored dynamics encode each frame once for its J sequences and render no frame but the last, and
         without `with_tokens` none, so it is much faster than `imagine`.
         """
-        self._require_success_weights(frames)
-        weights = frames.success_weights
+        self._require_instruction_weights(frames)
+        weights = frames.instruction_weights
         if weights is not None:
             weights = weights[spread_rows(len(frames), len(actions), actions.device)]
-        encode = partial(self.encode_actions, success_weights=weights)
+        encode = partial(self.encode_actions, instruction_weights=weights)
         prediction = self.dynamics.open_loop(self._normalized(frames), actions, encode, with_tokens)
         return prediction._replace(state=self.denormalize_state(prediction.state))
 
@@ -142,7 +147,7 @@ class ImaginationMixin:
             images, features = self.tokenizer.decode_with_features(tokens, context)
         return Decoded(images.float(), [feature.float() for feature in features])
 
-    def encode_actions(self, actions: Tensor, success_weights: Tensor | None = None) -> Condition:
+    def encode_actions(self, actions: Tensor, instruction_weights: Tensor | None = None) -> Condition:
         """Actions (B, T, A) in dataset units, and the weights of the instructions (B, E) → condition."""
         raise NotImplementedError(f"{self.name} is not conditioned on actions")
 
@@ -150,7 +155,7 @@ class ImaginationMixin:
         """One instruction for each of `batch` episodes → condition."""
         raise NotImplementedError(f"{self.name} is not conditioned on text")
 
-    def success_weights(self, instructions: Sequence[str], batch: int) -> Tensor | None:
+    def instruction_weights(self, instructions: Sequence[str], batch: int) -> Tensor | None:
         """Return what each instruction of `batch` episodes adds to the weights by which success is read.
 
         Returns:
@@ -161,9 +166,9 @@ class ImaginationMixin:
         """
         raise NotImplementedError
 
-    def _require_success_weights(self, frames: Frames) -> None:
+    def _require_instruction_weights(self, frames: Frames) -> None:
         """Raise ValueError if success depends on the instruction, and the frames lack its weights."""
-        if self.config.reads_instructions and frames.success_weights is None:
+        if self.config.reads_instructions and frames.instruction_weights is None:
             raise ValueError(
                 "task: this world model tells success by the instruction, and the frames have none; give one "
                 "for each episode"

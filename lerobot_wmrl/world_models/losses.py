@@ -96,7 +96,7 @@ def next_frame_loss(
     logits = prediction.logits[:, : target.codes.shape[1]]
     token_loss = masked_mean(codebook.cross_entropy(logits, target.codes), target.weight)
     state_loss = next_state_loss(prediction.state, clip)
-    weight = prediction.done_logit.new_tensor(clip.success_weight)
+    weight = prediction.done_logit.new_tensor(clip.done_pos_weight)
     done = F.binary_cross_entropy_with_logits(
         prediction.done_logit, clip.done, reduction="none", pos_weight=weight
     )

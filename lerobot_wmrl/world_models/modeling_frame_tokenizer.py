@@ -20,7 +20,7 @@ from lerobot_wmrl.world_models.goal import similarity_to_goal
 from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.perceptual import PerceptualLoss, lpips_network, require_backbone
 
-SUCCESS_WEIGHT: Final = 0.1
+CLASSIFIER_LOSS_WEIGHT: Final = 0.1
 """Weight of the success classifier's loss. They share no weights, only the limit on the gradient's norm."""
 
 COLLAPSE_BEGINS: Final = 0.1
@@ -123,7 +123,7 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         success_loss, success_metrics = self.tokenizer.success.loss(
             reference, images, batch["success"], batch.get("task", ())
         )
-        return loss + SUCCESS_WEIGHT * success_loss, metrics | success_metrics
+        return loss + CLASSIFIER_LOSS_WEIGHT * success_loss, metrics | success_metrics
 
     def _require_distinct(self, distinct: float) -> None:
         if round(distinct) <= 1:

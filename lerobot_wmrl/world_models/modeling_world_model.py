@@ -115,7 +115,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         if source is not None:
             self.tokenizer.load_state_dict(source.tokenizer.state_dict())
         self.tokenizer.eval()
-        self._success_weights: dict[str, Tensor] = {}
+        self._instruction_weights: dict[str, Tensor] = {}
         self.dynamics = make_dynamics(config, self.tokenizer.grid)
         done: Any = self.dynamics.network.done
         if config.predicts_success:
@@ -179,15 +179,15 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         return ((state - self.state_mean) / self.state_std).clamp(-STATE_LIMIT, STATE_LIMIT)
 
     @torch.no_grad()
-    def success_weights(self, instructions: Sequence[str], batch: int) -> Tensor | None:
+    def instruction_weights(self, instructions: Sequence[str], batch: int) -> Tensor | None:
         if not self.config.reads_instructions:
             return None
         check_one_each(instructions, batch)
         classifier: Any = self.tokenizer.success
-        for text in set(instructions) - self._success_weights.keys():  # the tokenizer is fixed
-            self._success_weights[text] = classifier.instructions([text])[0]
-        device = self.state_mean.device
-        return torch.stack([self._success_weights[text].to(device) for text in instructions])
+        for text in set(instructions) - self._instruction_weights.keys():  # the tokenizer is fixed
+            self._instruction_weights[text] = classifier.instructions([text])[0]
+        device = self.device
+        return torch.stack([self._instruction_weights[text].to(device) for text in instructions])
 
     def condition(self, clip: Clip) -> Condition:
         """Return the condition (eq. 1's c) of every row of a clip, tokens (B, T or 1, M, D)."""
@@ -289,7 +289,7 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
                 "train it with this version of the package",
             )  # fmt: skip
         ends = embodiment.action_low, embodiment.action_high
-        low, high = (torch.tensor(end, device=self.state_mean.device) for end in ends)
+        low, high = (torch.tensor(end, device=self.device) for end in ends)
         return low, high
 
     def observation(self, images: Tensor, state: Tensor, instructions: Sequence[str]) -> dict[str, Any]:
@@ -316,7 +316,7 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         """Return a compact observation with frames of the dataset's sizes; those that have them stay."""
         return stretch_cameras(observation, self.config.trained_tokenizer.frame_shapes)
 
-    def encode_actions(self, actions: Tensor, success_weights: Tensor | None = None) -> Condition:
+    def encode_actions(self, actions: Tensor, instruction_weights: Tensor | None = None) -> Condition:
         if actions.shape[-1] != self.config.action_size:
             raise ValueError(
                 f"action: {actions.shape[-1]} components, but the world model was trained with "
@@ -324,11 +324,11 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
             )
         normalised = (actions - self.action_mean) / self.action_std
         tokens = self.embed_action(normalised).unflatten(-1, (CONDITION_TOKENS, -1))
-        weights = None if success_weights is None else success_weights[:, None]
-        return Condition(tokens, success_weights=weights)
+        weights = None if instruction_weights is None else instruction_weights[:, None]
+        return Condition(tokens, instruction_weights=weights)
 
     def condition(self, clip: Clip) -> Condition:
-        return self.encode_actions(clip.action, self.success_weights(clip.instructions, len(clip.tokens)))
+        return self.encode_actions(clip.action, self.instruction_weights(clip.instructions, len(clip.tokens)))
 
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
@@ -381,9 +381,9 @@ class TextWorldModelRewardModel(WorldModelRewardModel):
 
     def encode_instructions(self, instructions: Sequence[str], batch: int) -> Condition:
         check_one_each(instructions, batch)
-        weights = self.success_weights(instructions, batch)
+        weights = self.instruction_weights(instructions, batch)
         condition: Condition = self.text_encoder(instructions)
-        return condition._replace(success_weights=None if weights is None else weights[:, None])
+        return condition._replace(instruction_weights=None if weights is None else weights[:, None])
 
     def condition(self, clip: Clip) -> Condition:
         return self.encode_instructions(clip.instructions, len(clip.tokens))

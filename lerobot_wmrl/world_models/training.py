@@ -25,7 +25,7 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.optim import Optimizer
 from tqdm import tqdm
 
-from lerobot_wmrl.common.checkpoints import latest_checkpoint, should_save_checkpoint
+from lerobot_wmrl.common.checkpoints import newest_checkpoint, should_save_checkpoint
 from lerobot_wmrl.common.constants import HUMAN_LIKE, KINDS, START_KIND
 from lerobot_wmrl.common.cuda_graphs import cuda_graphs
 from lerobot_wmrl.common.distributed import is_first_process, mean_over_processes, process_seed
@@ -66,7 +66,7 @@ class TrainingSettings(Protocol):
 
 def build_model(config: RewardModelConfig, table: EpisodeTable, output_dir: Path) -> PreTrainedRewardModel:
     """Return a fresh model with the dataset's statistics, or the latest checkpoint of this run."""
-    checkpoint, meta = latest_checkpoint(output_dir), table.dataset.meta
+    checkpoint, meta = newest_checkpoint(output_dir), table.dataset.meta
     if checkpoint is not None:
         model: PreTrainedRewardModel = load_model(checkpoint, config.type, config.device or "cpu")
         check_dataset(model.config, meta)
@@ -88,8 +88,8 @@ def decide_on_instructions(config: RewardModelConfig, table: EpisodeTable, data:
     if not isinstance(config, FrameTokenizerConfig) or not config.tokenizer.success or config.pretrained_path:
         return
     asked = config.tokenizer.instructions
-    tables = [table.subset(learnt_episodes(table, data.episodes))]
-    tables += [each.subset(learnt_episodes(each, None)) for each in data.read_more()]
+    tables = [table.subset(table.training(data.episodes))]
+    tables += [each.subset(each.training(None)) for each in data.read_more()]
     reads = count_tasks(tables) > 1 if asked is None else asked
     problem = reads and unreadable(text for each in tables for text in each.instructions)
     if problem and asked:
@@ -100,12 +100,6 @@ def decide_on_instructions(config: RewardModelConfig, table: EpisodeTable, data:
     if problem:
         logging.warning("success is told without the instructions, one of which cannot be read: %s", problem)
     config.tokenizer = replace(config.tokenizer, instructions=reads and not problem)
-
-
-def learnt_episodes(table: EpisodeTable, chosen: Sequence[int] | None) -> np.ndarray:
-    """Mark the `chosen` episodes (all if None) that are not held out. (E,)"""
-    marked: np.ndarray = ~table.validation & table.among(chosen)
-    return marked
 
 
 def golden_episodes(table: EpisodeTable) -> np.ndarray:
@@ -136,7 +130,7 @@ def make_sampler(
     Raises:
         FieldError: there is no episode to learn from.
     """
-    episodes = learnt_episodes(table, chosen)
+    episodes = table.training(chosen)
     if not episodes.any():
         raise FieldError(
             "dataset.root", table.dataset.root, "has no episode to train on",
@@ -236,7 +230,7 @@ def note_outcomes(
     A model that is trained further keeps what it has learnt from before, if that was more.
     """
     labelled = [(table, chosen) for table, chosen in sources if table.done_known]
-    learnt = [table.success[learnt_episodes(table, chosen)] for table, chosen in labelled]
+    learnt = [table.success[table.training(chosen)] for table, chosen in labelled]
     if not learnt and config.pretrained_path and config.learnt_successes is None:
         return  # what it has learnt before is not known
     for table, _ in labelled:
@@ -279,7 +273,7 @@ def train(
     preset: Any = model.config.get_optimizer_preset()
     optimizer = preset.build([p for p in model.parameters() if p.requires_grad])
     scheduler = cosine_schedule(preset.lr, settings.steps).build(optimizer, settings.steps)
-    checkpoint = latest_checkpoint(settings.output_dir)
+    checkpoint = newest_checkpoint(settings.output_dir)
     first = 0 if checkpoint is None else load_training_state(checkpoint, optimizer, scheduler)
     network = DistributedDataParallel(model) if processes.num_processes > 1 else model
 
@@ -345,7 +339,7 @@ def held_out_metrics(model: Any, table: EpisodeTable, batch_size: int) -> dict[s
     if not episodes.any():
         return {}
     sampler = make_clip_sampler(model, table, episodes.nonzero()[0], batch_size, seed=0)
-    sampler.success_weight = 1.0
+    sampler.done_pos_weight = 1.0
     model.eval()
     every = []
     with torch.random.fork_rng():

@@ -91,8 +91,8 @@ class WmMpcPolicy(PreTrainedPolicy):
         tokens = model.tokenizer.encode(images, self._context)
         state = self._state(batch, tokens)
         instructions = list(batch.get("task", []))
-        weights = model.success_weights(instructions, len(tokens))
-        frames = Frames(tokens, state, self._context, success_weights=weights)
+        weights = model.instruction_weights(instructions, len(tokens))
+        frames = Frames(tokens, state, self._context, instruction_weights=weights)
         proposed = None
         if self.proposal is not None:
             proposed = self.proposal.actions(frames, batch, images, self.config.horizon)

@@ -7,7 +7,7 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import PushtEnv
 
-from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import model_folder
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.content import content_of
@@ -18,7 +18,7 @@ def test_models_datasets_and_files_are_known_by_their_content(
     trained_models: dict[str, Path], small_dataset: LeRobotDataset, tmp_path: Path
 ) -> None:
     for name in ("action_world_model", "text_world_model"):
-        shutil.copytree(resolve_checkpoint(trained_models[name]), tmp_path / name)
+        shutil.copytree(model_folder(trained_models[name]), tmp_path / name)
     shutil.copytree(small_dataset.root, tmp_path / "data")
     frames = tmp_path / "frames.npz"
     frames.write_bytes(b"first")

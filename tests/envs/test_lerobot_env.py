@@ -23,9 +23,9 @@ from lerobot_wmrl.envs.lerobot_env import (
     check_real_env,
     make_tensor_env,
 )
+from lerobot_wmrl.rl.compatibility import check_tasks
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
-from lerobot_wmrl.rl.fit import check_tasks
 from lerobot_wmrl.scripts.train import main
 from tests.rl.checkpoints import save_untrained_policy
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
-from lerobot_wmrl.common.checkpoints import Checkpoint, resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import Checkpoint, model_folder
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import ChosenEpisodes
@@ -144,7 +144,7 @@ def test_a_world_model_without_a_known_success_is_refused_by_the_commands_own_fl
     imagination, small_dataset, tmp_path
 ):
     root = tmp_path / "model"
-    shutil.copytree(resolve_checkpoint(imagination.world_model_path), root)
+    shutil.copytree(model_folder(imagination.world_model_path), root)
     config = json.loads((root / "config.json").read_text())
     (root / "config.json").write_text(json.dumps({**config, "learnt_successes": 0}))
     cfg = EvalWorldModelConfig(

@@ -12,17 +12,15 @@ from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.episodes import solved_at_end
 from lerobot_wmrl.evaluation.gate import (
     Gate,
-    Outcomes,
     best_operating_point,
-    by_task,
     done_accuracy,
     done_delay,
     done_log_loss,
-    first_run,
     gate_at,
     gate_details,
     sweep,
 )
+from lerobot_wmrl.evaluation.outcomes import Outcomes, by_task, first_run
 from lerobot_wmrl.evaluation.report import gate_lines, task_table
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_wmrl.common.checkpoints import Checkpoint, resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import Checkpoint, model_folder
 from lerobot_wmrl.common.errors import FieldError, Stopped
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import ChosenEpisodes
@@ -28,8 +28,8 @@ from lerobot_wmrl.evaluation.evidence import (
     trained_inside,
     training_folder,
 )
-from lerobot_wmrl.evaluation.gate import Outcomes
 from lerobot_wmrl.evaluation.judgement import Judgement
+from lerobot_wmrl.evaluation.outcomes import Outcomes
 from lerobot_wmrl.scripts.judge import JudgeConfig, even_batch, judge, main, starts_of_one_task
 from tests.relabelled import relabelled
 from tests.rl.checkpoints import save_untrained_policy
@@ -298,7 +298,7 @@ def test_a_policy_is_not_also_a_reference(config, seeing, tmp_path):
 
 
 def settings_of(checkpoint: str) -> Path:
-    return resolve_checkpoint(checkpoint) / "train_config.json"
+    return model_folder(checkpoint) / "train_config.json"
 
 
 def test_a_policy_that_was_trained_in_the_world_model_is_refused(config, seeing, trained_models):
@@ -359,12 +359,12 @@ def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
     assert learnt_from(model, LabelledRollouts.read(again)) == 6
     assert learnt_from(model, LabelledRollouts.read(again, episodes=[0, 3])) == 2
     copy = tmp_path / "parts"
-    shutil.copytree(resolve_checkpoint(config.world_model.path), copy)
+    shutil.copytree(model_folder(config.world_model.path), copy)
     write(copy / "train_config.json", {"dataset": {"root": config.dataset.root, "episodes": [0, 1]}})
     assert learnt_from(str(copy), LabelledRollouts.read(config.dataset, episodes=[2, 3])) == 0
     assert learnt_from(str(copy), LabelledRollouts.read(config.dataset, episodes=[1, 2])) == 1
     copy = tmp_path / "model"
-    shutil.copytree(resolve_checkpoint(config.world_model.path), copy)
+    shutil.copytree(model_folder(config.world_model.path), copy)
     write(copy / "train_config.json", {"dataset": {"root": "demonstrations", "more": [others.root]}})
     assert learnt_from(str(copy), LabelledRollouts.read(others)) == 3
     (tmp_path / "further").mkdir()

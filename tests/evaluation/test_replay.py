@@ -25,7 +25,8 @@ from lerobot_wmrl.evaluation.accuracy import (
     measure,
     robustness,
 )
-from lerobot_wmrl.evaluation.gate import Outcomes, gate_at, success_gate
+from lerobot_wmrl.evaluation.gate import gate_at, success_gate
+from lerobot_wmrl.evaluation.outcomes import Outcomes
 from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording, replay_episodes
 from lerobot_wmrl.evaluation.report import evaluate
 from lerobot_wmrl.evaluation.reward_curves import reward_along_episode

@@ -8,7 +8,7 @@ import pytest
 from experiments.told import other_instructions, outcomes_with, told
 from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
-from lerobot_wmrl.evaluation.gate import seen_outcomes
+from lerobot_wmrl.evaluation.outcomes import seen_outcomes
 from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.world_models.checkpoint import load_model
 from tests.trained import PULL, PUSH, told_apart

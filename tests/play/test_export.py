@@ -191,7 +191,7 @@ def test_a_page_reads_the_instruction_that_it_is_given(make_synthetic_dataset, t
             assert shown == pytest.approx(float(expected[0]), abs=1e-3)
             chances.append(shown)
             asked = replace(
-                frames, success_weights=model.success_weights([given.get("instruction", PUSH)], 1)
+                frames, instruction_weights=model.instruction_weights([given.get("instruction", PUSH)], 1)
             )
             imagined = model.step(model.start(asked), torch.from_numpy(actions[:1])).done_logit.sigmoid()
             assert shown == pytest.approx(float(imagined), abs=0.02)

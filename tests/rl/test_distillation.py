@@ -27,7 +27,7 @@ from torch import Tensor
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
-from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import model_folder
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.pipeline import action_unit, unchanged
@@ -126,7 +126,7 @@ def test_imagined_frames_are_kept_as_small_as_they_are_imagined(
 ) -> None:
     """The policy sees them in the size of its camera's, and recorded ones in full."""
     world_model = tmp_path / "world_model"
-    shutil.copytree(resolve_checkpoint(trained_models["action_world_model"]), world_model)
+    shutil.copytree(model_folder(trained_models["action_world_model"]), world_model)
     config = json.loads((world_model / "config.json").read_text())
     config["tokenizer"]["frame_sizes"] = [[48, 80]]
     write_json(world_model / "config.json", config)

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import model_folder
 from lerobot_wmrl.common.constants import GATE_SEED
 from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.files import write_json
@@ -19,7 +19,8 @@ from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.evaluation.gate import Gate, gate_at, labelled_recording, predict_outcomes
+from lerobot_wmrl.evaluation.gate import Gate, gate_at
+from lerobot_wmrl.evaluation.outcomes import labelled_recording, predict_outcomes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl import recorders
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
@@ -118,7 +119,7 @@ def test_rollouts_that_a_dyna_round_has_learnt_from_are_warned_about(
 ) -> None:  # fmt: skip
     root = str(make_synthetic_dataset(tmp_path / "recorded", episodes=3, length=5).root)
     newer = tmp_path / "newer"
-    shutil.copytree(resolve_checkpoint(trained_models["action_world_model"]), newer)
+    shutil.copytree(model_folder(trained_models["action_world_model"]), newer)
     write_json(newer / "train_config.json", {"dataset": {"root": "elsewhere", "more": [root]}})
     gate = make_gate(BELIEVES_NONE)
     gate.config.dataset = DatasetSource(root)

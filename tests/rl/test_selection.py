@@ -19,7 +19,7 @@ from lerobot_wmrl.envs import start_frames, world_model_env
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import StartImages
-from lerobot_wmrl.evaluation.policy_rollouts import Evaluated
+from lerobot_wmrl.evaluation.policy_rollouts import PolicyEvaluation
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl import make_callbacks
 from lerobot_wmrl.rl.callbacks import Record
@@ -44,7 +44,7 @@ def record(real: float | None, imagined: float | None, n: int = N) -> Record:
 
 
 def measure(successes: int, n: int = 4, steps: int = 30) -> Measure:
-    return lambda: Evaluated({("suite", 0, seed): seed < successes for seed in range(n)}, steps)
+    return lambda: PolicyEvaluation({("suite", 0, seed): seed < successes for seed in range(n)}, steps)
 
 
 def make_selection(tmp_path: Path, **measures: Measure) -> Selection:

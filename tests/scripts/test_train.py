@@ -20,10 +20,10 @@ from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import RuleBasedReward
+from lerobot_wmrl.rl.compatibility import rollout_length, settle_discount, warn_of_discount
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
-from lerobot_wmrl.rl.fit import check_discount, rollout_length, settle_discount
 from lerobot_wmrl.rl.trained_policy import evaluation
 from lerobot_wmrl.scripts.train import main
 from tests.commands import run_here
@@ -250,7 +250,7 @@ def test_another_discount_of_progress_than_ppos_is_warned_of(
 ) -> None:
     env = WmrlManiSkillEnv(reward=flags.get("reward", RuleBasedReward()))
     cfg = TrainConfig(env=env, algorithm=PPOConfig(gamma=flags.get("gamma")))
-    check_discount(cfg, longest=60)
+    warn_of_discount(cfg, longest=60)
     assert ("env.reward.gamma=0.98: progress" in caplog.text) == warned
     assert ("set --env.reward.gamma=0.9" in caplog.text) == warned
 
@@ -260,7 +260,7 @@ def test_grpo_pays_for_progress_without_a_discount(caplog: pytest.LogCaptureFixt
     env = WmrlManiSkillEnv()
     cfg = TrainConfig(env=env, algorithm=GRPOConfig())
     settle_discount(cfg)
-    check_discount(cfg, longest=40)
+    warn_of_discount(cfg, longest=40)
     assert not caplog.text
     for level in (0.2, 0.8):
         path = [0.0, *[level] * 40]
@@ -268,7 +268,7 @@ def test_grpo_pays_for_progress_without_a_discount(caplog: pytest.LogCaptureFixt
         assert sum(rewards) == pytest.approx(0.1 * level)
     given = TrainConfig(env=WmrlManiSkillEnv(reward=RuleBasedReward(gamma=0.9)), algorithm=GRPOConfig())
     settle_discount(given)
-    check_discount(given, longest=40)
+    warn_of_discount(given, longest=40)
     assert "env.reward.gamma=0.9: progress is rewarded with this discount, and GRPO has 1.0" in caplog.text
 
 

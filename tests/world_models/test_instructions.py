@@ -16,7 +16,7 @@ from lerobot_wmrl.data.dataset import TrainingData, open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, count_tasks, read_episodes
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.evaluation.gate import predict_done, seen_outcomes
+from lerobot_wmrl.evaluation.outcomes import predict_done, seen_outcomes
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
 from lerobot_wmrl.play.graphs import instruction_bytes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -62,7 +62,7 @@ def first_frames(model: Any, dataset: Any, instructions: list[str]) -> Frames:
     """The first frame of the first episode, once for each instruction."""
     recording = Recording.read(read_episodes(dataset), model)
     frames = recording.starts(model, np.zeros(len(instructions), int))
-    return replace(frames, success_weights=model.success_weights(instructions, len(instructions)))
+    return replace(frames, instruction_weights=model.instruction_weights(instructions, len(instructions)))
 
 
 def moved_squares(count: int, seed: int) -> tuple[Tensor, Tensor, Tensor, list[str]]:
@@ -189,13 +189,13 @@ def test_an_episode_that_begins_anew_has_its_own_instruction(model, two_tasks):
     expected = model.step(model.start(first_frames(model, two_tasks, [PUSH, PULL])), action).done_logit
     torch.testing.assert_close(found, expected)
     assert torch.equal(
-        model.newest(imagination).success_weights,
-        first_frames(model, two_tasks, [PUSH, PULL]).success_weights,
+        model.newest(imagination).instruction_weights,
+        first_frames(model, two_tasks, [PUSH, PULL]).instruction_weights,
     )
 
 
 def test_frames_without_an_instruction_are_refused(model, two_tasks):
-    frames = replace(first_frames(model, two_tasks, [PUSH]), success_weights=None)
+    frames = replace(first_frames(model, two_tasks, [PUSH]), instruction_weights=None)
     for imagine in (model.start, lambda each: model.open_loop(each, torch.zeros(1, 3, 7))):
         with pytest.raises(ValueError, match=r"^task: this world model tells success by the instruction"):
             imagine(frames)
@@ -203,7 +203,7 @@ def test_frames_without_an_instruction_are_refused(model, two_tasks):
     with pytest.raises(ValueError, match=r"^task: this world model"):
         model.restart(imagination, torch.tensor([True]), frames)
     with pytest.raises(ValueError, match=r"^task: 1 instructions for 2 episodes"):
-        model.success_weights([PUSH], 2)
+        model.instruction_weights([PUSH], 2)
 
 
 def test_the_environment_reads_the_instruction_of_each_start(trained, two_tasks):
@@ -221,7 +221,7 @@ def test_the_environment_reads_the_instruction_of_each_start(trained, two_tasks)
     model = env.model
     chances = []
     for asked in (texts, texts[::-1]):
-        frames = replace(env.starts.frames, success_weights=model.success_weights(asked, 6))
+        frames = replace(env.starts.frames, instruction_weights=model.instruction_weights(asked, 6))
         chances.append(model.step(model.start(frames), torch.zeros(6, 7)).done_logit.sigmoid())
     torch.testing.assert_close(info["reward_parts"]["done_probability"], chances[0])
     assert (chances[0] - chances[1]).abs().min() > 1e-3
@@ -270,7 +270,7 @@ def test_a_text_world_model_reads_success_by_its_instruction_too(two_tasks, trai
     config = TextWorldModelConfig(tokenizer_path=str(tokenizer), device="cpu", **nested(settings))
     path = run_training(config, Path(two_tasks.root), tmp_path / "text")
     text = load_model(path, "text_world_model")
-    assert text.encode_instructions([PUSH, PULL], 2).success_weights.shape[:2] == (2, 1)
+    assert text.encode_instructions([PUSH, PULL], 2).instruction_weights.shape[:2] == (2, 1)
     assert text.config.reads_instructions
 
 

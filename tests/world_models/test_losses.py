@@ -80,7 +80,7 @@ def test_unknown_outcomes_do_not_train_done():
 def test_rare_success_counts_more_in_the_loss_of_done():
     clip, prediction, codes = clip_and_prediction(torch.ones(2, 5, dtype=torch.bool))
     missed = prediction._replace(done_logit=torch.full((2, 5), -20.0))
-    clip = clip._replace(done=torch.eye(5)[:2], success_weight=7.0)
+    clip = clip._replace(done=torch.eye(5)[:2], done_pos_weight=7.0)
     _, metrics = loss_of(missed, codes, clip)
     assert metrics["done_loss"] == pytest.approx(7 * 20 * 2 / 10)
 

@@ -14,7 +14,7 @@ from lerobot_wmrl.data.clips import MOST_WEIGHT, SUCCESS_SHARE, ClipSampler, Fra
 from lerobot_wmrl.data.dataset import TrainingData
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_features, cached_frames, frames_to_tensor
-from lerobot_wmrl.evaluation.gate import Outcomes, predict_done, seen_outcomes
+from lerobot_wmrl.evaluation.outcomes import Outcomes, predict_done, seen_outcomes
 from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
@@ -183,7 +183,7 @@ def test_rare_success_weighs_as_much_as_a_twentieth_in_the_loss_of_done(length: 
     sampler = ClipSampler(
         table, np.zeros((len(table.done), 4), np.int32), np.arange(10), 8, 0.5, 2, seed=0, device="cpu"
     )
-    assert sampler(0).success_weight == pytest.approx(weight)
+    assert sampler(0).done_pos_weight == pytest.approx(weight)
 
 
 @torch.no_grad()

@@ -13,7 +13,7 @@ from huggingface_hub import HfApi, constants
 from safetensors.torch import load_file
 from transformers import BertConfig
 
-from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import model_folder
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.output_folders import CONFIG_FILE
 from lerobot_wmrl.world_models import losses
@@ -83,7 +83,7 @@ def test_one_instruction_for_two_episodes_is_refused():
 
 
 def test_a_checkpoint_carries_its_frozen_t5_in_files_that_lerobot_publishes(trained, tmp_path):
-    folder = resolve_checkpoint(trained)
+    folder = model_folder(trained)
     moved = shutil.copytree(folder, tmp_path / "elsewhere")
     files = [path for path in moved.rglob("*") if path.is_file()]
     assert all(path.suffix in LEROBOT_PUBLISHES for path in files)
@@ -116,7 +116,7 @@ def test_it_loads_from_the_hub_by_its_id(trained, tmp_path, monkeypatch):
         api = HfApi(hub.url, WRITE_TOKEN)
         api.create_repo("somebody/golden")
         api.upload_folder(
-            repo_id="somebody/golden", folder_path=resolve_checkpoint(trained),
+            repo_id="somebody/golden", folder_path=model_folder(trained),
             allow_patterns=[f"*{suffix}" for suffix in LEROBOT_PUBLISHES],
         )  # fmt: skip
         own = {"HF_ENDPOINT": hub.url, "HF_HOME": str(tmp_path), "HF_HUB_DISABLE_XET": "1"}
@@ -130,7 +130,7 @@ def test_it_loads_from_the_hub_by_its_id(trained, tmp_path, monkeypatch):
 
 
 def test_a_checkpoint_that_lost_its_t5_is_named(trained, tmp_path):
-    lost = shutil.copytree(resolve_checkpoint(trained), tmp_path / "lost")
+    lost = shutil.copytree(model_folder(trained), tmp_path / "lost")
     shutil.rmtree(lost / "text_encoder")
     with pytest.raises(ValueError, match=r"lost: the text encoder in its folder text_encoder cannot be read"):
         load_model(lost, "text_world_model")

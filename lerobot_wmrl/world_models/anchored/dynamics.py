@@ -79,7 +79,7 @@ class AnchoredDynamics(Dynamics):
         codes, state, dtype = self._first(frames, dtype)
         shape = (len(network.trajectory), len(codes), 1, network.heads, network.window, network.head_width)
         cache = KVCache.empty(shape, codes.device, dtype)
-        return AnchoredImagination(codes, state, cache, frames.context, frames.success_weights)
+        return AnchoredImagination(codes, state, cache, frames.context, frames.instruction_weights)
 
     @torch.no_grad()
     def step(self, imagination: Imagination, condition: Condition) -> Imagined:
@@ -95,7 +95,7 @@ class AnchoredDynamics(Dynamics):
             assert imagination.rollout is not None
             prediction, rollout = network.follow(
                 imagination.scene, imagination.rollout, condition.mean(), imagination.advance(), None,
-                condition.success_weights,
+                condition.instruction_weights,
             )  # fmt: skip
             imagination.rollout = rollout.last()
             codes = network.codebook.most_likely(prediction.logits)

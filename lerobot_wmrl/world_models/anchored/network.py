@@ -246,7 +246,7 @@ class AnchoredNetwork(FrameNetwork):
         mean = condition.mean().expand(-1, length, -1)  # (B·J, T, D)
         scene, begin = self.encode(codes, state, context)
         begin = StateRollout(*(spread(tensor, len(mean)) for tensor in begin))
-        return self.follow(scene, begin, mean, memory, steps, condition.success_weights)[0]
+        return self.follow(scene, begin, mean, memory, steps, condition.instruction_weights)[0]
 
     def encode(self, codes: Tensor, state: Tensor, context: Context) -> tuple[EncodedScene, StateRollout]:
         """Encode first frames: codes (B, 1, S, C), states (B, 1, P) and their episodes' context.
@@ -277,7 +277,7 @@ class AnchoredNetwork(FrameNetwork):
         mean: Tensor,
         memory: TemporalMemory,
         steps: Tensor | None,
-        success_weights: Tensor | None,
+        instruction_weights: Tensor | None,
     ) -> tuple[Prediction, StateRollout]:
         """Predict T frames of a scene under the conditions' means (B, T, D), from a state rollout (T = 1) on.
 
@@ -295,7 +295,7 @@ class AnchoredNetwork(FrameNetwork):
         logits = self._render(scene, hidden if steps is None else take_steps(hidden, steps))
         with compute_in(torch.float32, x.device):
             hidden = hidden.float()
-            read = () if success_weights is None else (success_weights,)
+            read = () if instruction_weights is None else (instruction_weights,)
             return Prediction(logits, self.done(hidden, *read).squeeze(-1), rollout.state, hidden), rollout
 
     def _render(self, scene: EncodedScene, hidden: Tensor) -> Tensor:

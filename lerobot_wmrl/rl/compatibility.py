@@ -3,35 +3,32 @@
 import logging
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.policies import LoadedPolicy, adopt_features, check_fit, learnt_range
+from lerobot_wmrl.common.policies import LoadedPolicy, adopt_features, check_fit
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.envs.lerobot_env import LeRobotTensorEnv, check_frame_rate, check_real_env, shapes_of
+from lerobot_wmrl.envs.lerobot_env import check_frame_rate, check_real_env, shapes_of
 from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import RuleBasedReward, potential_discount
-from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
+from lerobot_wmrl.rl.configuration_algorithms import AlgorithmConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
 
 
-def fit(cfg: TrainConfig, policy: LoadedPolicy, env: TensorEnv) -> None:
+def match_policy_to_env(cfg: TrainConfig, policy: LoadedPolicy, env: TensorEnv) -> None:
     """Let a policy see what its environment shows and act as far as it has learnt to.
 
     Raises:
         FieldError: they do not fit each other, the algorithm or `real_env`.
     """
     check_tasks(cfg, env)
-    check_discount(cfg, env.max_episode_steps)
+    warn_of_discount(cfg, env.max_episode_steps)
     observation, _ = env.reset(seed=cfg.seed)
     shown = shapes_of(observation)
     adopt_features(policy.config, shown)
     check_fit(policy.config, shown, env.single_action_space.shape[-1])
-    if isinstance(env, WorldModelVectorEnv):
-        env.model.check_units(policy.config, policy.postprocessor)
-    if isinstance(env, LeRobotTensorEnv) and (learnt := learnt_range(policy.postprocessor)):
-        env.widen(*learnt)
+    env.accept(policy)
     if cfg.real_env is not None:
         check_real_env(policy.config, cfg.real_env)
         if isinstance(env, WorldModelVectorEnv):
@@ -39,15 +36,17 @@ def fit(cfg: TrainConfig, policy: LoadedPolicy, env: TensorEnv) -> None:
 
 
 def check_tasks(cfg: TrainConfig, env: TensorEnv) -> None:
-    """Raise FieldError if a task has no environment, or if GRPO finds no two episodes from the same start."""
-    tasks, grpo = env.tasks, isinstance(cfg.algorithm, GRPOConfig)
-    if grpo and tasks > 1:
+    """Raise FieldError if a task has no environment, or if an algorithm that compares episodes from
+    the same start, GRPO, finds no two."""
+    assert isinstance(cfg.algorithm, AlgorithmConfig), "as `TrainConfig.validate` has checked"
+    tasks, compares_starts = env.tasks, cfg.algorithm.compares_starts
+    if compares_starts and tasks > 1:
         raise FieldError(
             "algorithm.type", cfg.algorithm.type,
             f"compares episodes from the same start, and the environment has {tasks} tasks",
             "choose one task, or ppo",
         )  # fmt: skip
-    if grpo and not env.repeats_starts():
+    if compares_starts and not env.repeats_starts():
         raise FieldError(
             "algorithm.type", cfg.algorithm.type,
             "compares episodes from the same start, and in this environment a seed does not decide it",
@@ -76,18 +75,18 @@ def progress_reward(cfg: TrainConfig) -> GeneralConfig | RuleBasedReward | None:
     return reward if reward.alpha < 1 and reward.form == "potential" else None
 
 
-def check_discount(cfg: TrainConfig, longest: int) -> None:
+def warn_of_discount(cfg: TrainConfig, longest: int) -> None:
     """Warn if progress is rewarded with another discount than the algorithm's, in episodes of up to `longest`
     steps."""
-    reward, algorithm = progress_reward(cfg), cfg.algorithm
-    if reward is None or not isinstance(algorithm, PPOConfig | GRPOConfig):
+    assert isinstance(cfg.algorithm, AlgorithmConfig), "as `TrainConfig.validate` has checked"
+    reward, discount = progress_reward(cfg), cfg.algorithm.discount(longest)
+    if reward is None or discount is None:
         return
-    discount = algorithm.discount(longest) if isinstance(algorithm, PPOConfig) else 1.0
     if (reward_discount := potential_discount(reward, longest)) != discount:
         logging.warning(
             "env.reward.gamma=%s: progress is rewarded with this discount, and %s has %s, so that the time "
             "spent near the goal counts too; set --env.reward.gamma=%s",
-            reward_discount, algorithm.type.upper(), discount, discount,
+            reward_discount, cfg.algorithm.type.upper(), discount, discount,
         )  # fmt: skip
 
 
