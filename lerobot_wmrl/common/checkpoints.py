@@ -5,6 +5,7 @@ import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -60,6 +61,16 @@ def model_folder(path: str | Path) -> Path:
     return root
 
 
+def settled_folder(path: str) -> Path:
+    """Return `model_folder` with the checkpoint behind the link `last` in place of it: the link moves on."""
+    folder = model_folder(path)
+    if not folder.is_dir():
+        return folder
+    settled = folder.resolve()
+    below = not folder.is_absolute() and settled.is_relative_to(Path.cwd())
+    return settled.relative_to(Path.cwd()) if below else settled
+
+
 def resolved_path(path: str) -> str:
     """Return the folder of a checkpoint's model, with `config.json` in it, as LeRobot's commands take it.
 
@@ -79,11 +90,25 @@ def resolved_name(path: str) -> str:
     return str(folder.parent if folder.name == PRETRAINED_MODEL_DIR else folder)
 
 
-def local_model_folder(path: str | Path, files: Sequence[str] | None = None) -> Path:
+def local_model_folder(
+    path: str | Path, files: Sequence[str] | None = None, revision: str | None = None
+) -> Path:
     """Return the folder with a checkpoint's model. One on the hub is downloaded into its cache, all of it or
-    the files of some patterns."""
+    the files of some patterns, of a branch, tag or commit if it is given."""
     folder = model_folder(path)
-    return folder if folder.is_dir() else Path(snapshot_download(str(path), allow_patterns=files))
+    if folder.is_dir():
+        return folder
+    return Path(snapshot_download(str(path), revision=revision, allow_patterns=files))
+
+
+def given_revision(overrides: Sequence[str]) -> str | None:
+    """Return the last `--pretrained_revision` among flags; None if there is none."""
+    revision = None
+    for flag, following in pairwise([*overrides, ""]):
+        name, is_same, value = flag.partition("=")
+        if name == "--pretrained_revision":
+            revision = value if is_same else following
+    return None if revision in ("", "null") else revision
 
 
 def last_model(folder: Path) -> Path:

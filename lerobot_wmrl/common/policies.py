@@ -14,21 +14,40 @@ from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from lerobot_wmrl.common.checkpoints import ADAPTERS_FILE, local_model_folder, model_folder
+from lerobot_wmrl.common.checkpoints import (
+    ADAPTERS_FILE,
+    given_revision,
+    local_model_folder,
+    settled_folder,
+)
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.files import whole_folder
 
 
 def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
-    """Read the configuration of a policy's checkpoint. Raises FieldError if it is none."""
-    folder = model_folder(path)
+    """Read the configuration of a policy's checkpoint.
+
+    What is loaded afterwards is the checkpoint that was there now: of a training the last one, of a name on
+    the hub with `pretrained_revision` that revision, which is downloaded into the cache.
+
+    Raises:
+        FieldError: there is no checkpoint, or none with these settings.
+    """
+    folder, revision = settled_folder(path), given_revision(overrides)
+    if revision and folder.exists():
+        raise FieldError(
+            "policy.pretrained_revision", revision, f"{path} is a folder, and these have no revisions",
+            "leave it out, or give the name of a policy on the hub",
+        )  # fmt: skip
     if not (folder / "config.json").is_file() and (folder.exists() or path.startswith((".", "/"))):
         raise FieldError(
             "policy.path", path, "no checkpoint there (config.json is missing)",
             "give the output folder of a policy's training, or a hub id",
         )  # fmt: skip
     try:
+        if revision:
+            folder = local_model_folder(path, revision=revision)
         config = PreTrainedConfig.from_pretrained(str(folder), cli_overrides=overrides)
     except SystemExit as error:  # of argparse, which has named them
         raise FieldError(
@@ -40,7 +59,7 @@ def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
             "policy.path", path, f"no policy can be loaded from it ({first_line(error)})",
             "give the output folder of a policy's training, or a hub id",
         ) from error  # fmt: skip
-    config.pretrained_path = folder
+    config.pretrained_path, config.pretrained_revision = folder, None
     return config
 
 

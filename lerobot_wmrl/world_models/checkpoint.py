@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,7 +12,7 @@ from lerobot.rewards.factory import get_reward_model_class
 from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors import SafetensorError
 
-from lerobot_wmrl.common.checkpoints import UNPUBLISHED, model_folder
+from lerobot_wmrl.common.checkpoints import UNPUBLISHED, given_revision, model_folder
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.data.checks import check_cameras, check_depth, check_widths
 from lerobot_wmrl.data.embodiment import check_same_robot
@@ -109,16 +108,6 @@ def config_to_continue(path: str, overrides: Sequence[str]) -> RewardModelConfig
         ) from error  # fmt: skip
     config.pretrained_path, config.pretrained_revision = str(folder), revision
     return config
-
-
-def given_revision(overrides: Sequence[str]) -> str | None:
-    """Return the last `--pretrained_revision` among flags; None if there is none."""
-    revision = None
-    for flag, following in pairwise([*overrides, ""]):
-        name, is_same, value = flag.partition("=")
-        if name == "--pretrained_revision":
-            revision = value if is_same else following
-    return None if revision in ("", "null") else revision
 
 
 def load_model_to_continue(config: RewardModelConfig, meta: Any) -> Any:

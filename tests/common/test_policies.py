@@ -10,6 +10,8 @@ from lerobot.processor import PolicyProcessorPipeline, UnnormalizerProcessorStep
 from safetensors.torch import load_file, save_model
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+from lerobot_wmrl.common.checkpoints import link_checkpoint
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import (
     check_fit,
     check_units,
@@ -19,6 +21,7 @@ from lerobot_wmrl.common.policies import (
     load_trained_weights,
     read_policy_config,
 )
+from tests.hub_server import Hub, Repo
 from tests.rl.checkpoints import save_untrained_policy
 
 IMAGE = "observation.images.third_view"
@@ -29,6 +32,34 @@ def test_the_output_folder_of_a_training_is_enough(tmp_path: Path) -> None:
     policy = load_policy(read_policy_config(str(tmp_path), []))
     saved = CnnPolicy.from_pretrained(folder).state_dict()
     assert all(torch.equal(value, saved[name]) for name, value in policy.state_dict().items())
+
+
+def test_the_checkpoint_that_was_the_last_one_stays_the_one_that_is_meant(tmp_path, monkeypatch) -> None:
+    """Adapters that are trained on it name it, and a longer training moves the link on."""
+    checkpoints = tmp_path / "sft" / "checkpoints"
+    save_untrained_policy(checkpoints / "000100" / "pretrained_model")
+    link_checkpoint(checkpoints / "000100", "last")
+    monkeypatch.chdir(tmp_path)
+    given = "sft", f"{tmp_path}/sft/checkpoints/last"
+    found = [read_policy_config(path, []).pretrained_path for path in given]
+    assert found == [folder / "sft/checkpoints/000100/pretrained_model" for folder in (Path(), tmp_path)]
+
+
+def test_of_a_revision_on_the_hub_all_is_loaded_from_there(hub: Hub, tmp_path: Path) -> None:
+    repo, saved = Repo(private=False), []
+    for seed in range(2):
+        torch.manual_seed(seed)
+        saved.append(save_untrained_policy(tmp_path / str(seed)))
+        repo.commit({file.name: file.read_bytes() for file in saved[-1].iterdir()})
+    hub.repos["models", "someone/policy"] = repo
+    first, second = repo.commits
+    for flags, folder in (([f"--pretrained_revision={first}"], saved[0]), ([], saved[1])):
+        loaded = load_policy(read_policy_config("someone/policy", flags)).state_dict()
+        wanted = CnnPolicy.from_pretrained(folder).state_dict()
+        assert all(torch.equal(value, wanted[name]) for name, value in loaded.items())
+    assert second == repo.refs["main"]
+    with pytest.raises(FieldError, match=r"^policy\.pretrained_revision=abc: .* is a folder"):
+        read_policy_config(str(saved[0]), ["--pretrained_revision=abc"])
 
 
 @pytest.mark.parametrize(("content", "message"), [
