@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
@@ -76,6 +77,7 @@ class RolloutRecorder:
         for each in self.envs:
             freeze_finished(each)
         self.robot = robot or robot_of(env, self.envs[0], like)
+        self.envs = [SuccessOfAll(each) for each in self.envs]
         self.range_is_guessed = robot is None and like is None and not isinstance(env, WorldModelEnv)
         try:
             self.encoder = encoder_of(self.columns or {})
@@ -192,6 +194,27 @@ class RolloutRecorder:
             dataset.add_frame({**kept, "task": (observation.get("task") or [""])[row]})
         save_episode(dataset)
         return success
+
+
+class SuccessOfAll(gym.vector.VectorWrapper):
+    """Says of every environment whether it has succeeded, also where others end in the same step.
+
+    LeRobot's rollout then looks at the episodes that end alone (`final_info`), and takes all others for
+    unsolved.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what LeRobot asks a vector environment for beside its interface, such as `call`."""
+        return getattr(self.env, name)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Take a step in all environments."""
+        observation, reward, terminated, truncated, info = self.env.step(actions)
+        final = info.get("final_info")
+        if isinstance(final, dict) and "is_success" in info:
+            ended, at_end = terminated | truncated, final.get("is_success", np.zeros(self.num_envs, bool))
+            info["final_info"] = {**final, "is_success": np.where(ended, at_end, info["is_success"])}
+        return observation, reward, terminated, truncated, info
 
 
 def robot_of(config: EnvConfig, env: Any, like: Any | None) -> Embodiment:

@@ -176,6 +176,31 @@ def test_a_finished_episode_is_not_reset_while_the_others_go_on(
     assert None not in resets[resets.index(7) :]
 
 
+def test_success_that_holds_is_recorded_whenever_other_episodes_end(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LeRobot's rollout takes what goes on for unsolved in a step in which anything ends."""
+    reset, step = PushTEnv.reset, PushTEnv.step
+
+    def noted(self: PushTEnv, seed: int | None = None, options: Any = None) -> Any:
+        self.ends, self.steps = seed == 7 if seed is not None else self.ends, 0
+        return reset(self, seed=seed, options=options)
+
+    def solved(self: PushTEnv, action: np.ndarray) -> Any:
+        seen, reward, _, truncated, info = step(self, action)
+        self.steps += 1
+        success = self.steps >= 2
+        return seen, reward, success and self.ends, truncated, {**info, "is_success": success}
+
+    monkeypatch.setattr(PushTEnv, "reset", noted)
+    monkeypatch.setattr(PushTEnv, "step", solved)
+    recorder = EnvRecorder(PushtEnv(episode_length=STEPS), ROBOT, "cpu", num_envs=2)
+    recorder.record(checkpoint, 2, 7, tmp_path / "rollouts")
+    table = read_episodes(open_dataset(tmp_path / "rollouts"))
+    assert table.length.tolist() == [2, STEPS]
+    assert table.done.tolist() == [False, True, *[False, True, True, True, True]]
+
+
 def test_actions_may_go_as_far_as_those_of_the_same_robots_dataset(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
