@@ -15,7 +15,7 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION, FreezeAfterEpisodeEnd, prepro
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import Observation
+from lerobot_wmrl.common.constants import EVALUATION_SEED, Observation
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.policies import LoadedPolicy, check_fit, learnt_range, seen_shape
 from lerobot_wmrl.envs.configuration_hub import HubEnv
@@ -180,6 +180,7 @@ class LeRobotTensorEnv(TensorEnv):
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin B episodes, from `seed`, `seed` + 1, … or from the seeds given.
 
+        The episodes after them have seeds that are drawn, from a generator that the first of these seeds.
         What a seed decides is up to the environment, see `repeats_starts`.
         """
         seeds: list[Any] = [None] * self.num_envs
@@ -187,6 +188,7 @@ class LeRobotTensorEnv(TensorEnv):
             seeds = (
                 list(seed) if isinstance(seed, list | tuple) else [seed + row for row in range(len(seeds))]
             )
+        self._later = np.random.default_rng(seeds[0])
         self._seen = [self._begin(row, each) for row, each in enumerate(seeds)]
         return self._stacked(self._seen), {}
 
@@ -210,7 +212,7 @@ class LeRobotTensorEnv(TensorEnv):
 
     def _restart(self, ended: Tensor, outcome: Outcome) -> Observation:
         for row in ended.nonzero()[:, 0].tolist():
-            self._seen[row] = self._begin(row, None)
+            self._seen[row] = self._begin(row, int(self._later.integers(EVALUATION_SEED)))
         return self._stacked(self._seen)
 
     def repeats_starts(self) -> bool:

@@ -96,6 +96,29 @@ def test_seeds_decide_where_episodes_begin(env: LeRobotTensorEnv) -> None:
     assert torch.equal(first[OBS_STATE][1], other[OBS_STATE][0])
 
 
+def test_later_episodes_are_the_same_again_too(
+    env: LeRobotTensorEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Aloha asks the operating system where to begin if it is given no seed."""
+    unseeded = np.random.default_rng()
+    for each in env.envs:
+        reset = each.unwrapped.reset
+        monkeypatch.setattr(
+            each.unwrapped, "reset",
+            lambda seed=None, reset=reset, **given: reset(
+                seed=int(unseeded.integers(2**31)) if seed is None else seed, **given
+            ),
+        )  # fmt: skip
+    begun = []
+    for seed in (5, 5, 6):
+        env.reset(seed=seed)
+        begun.append([env.step(torch.full((B, 2), 250.0))[0][OBS_STATE] for _ in range(2 * STEPS)])
+    for index in (STEPS - 1, 2 * STEPS - 1):
+        first, again, other = (steps[index] for steps in begun)
+        torch.testing.assert_close(again, first)
+        assert not torch.allclose(other, first)
+
+
 def test_actions_that_the_policy_has_learnt_are_not_clipped(
     env: LeRobotTensorEnv, caplog: pytest.LogCaptureFixture
 ) -> None:
