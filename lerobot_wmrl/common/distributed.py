@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from datetime import timedelta
 
 import torch
+from lerobot.utils.random_utils import set_seed
 from torch import Tensor, nn
 from torch import distributed as dist
 
@@ -26,6 +27,19 @@ def process_seed(seed: int) -> int:
     """Return the seed of this process in a run of this seed: far from those of runs with other seeds."""
     rank, _ = rank_and_size()
     return seed + PROCESS_STRIDE * rank
+
+
+def part_random_numbers(seed: int) -> None:
+    """Give every process but the first, which goes on as it would alone, random numbers of its own."""
+    if not is_first_process():
+        set_seed(process_seed(seed))
+
+
+def share_buffers(module: nn.Module) -> None:
+    """Replace a module's buffers, which no gradient keeps alike, by those of the first process."""
+    if rank_and_size()[1] > 1:
+        for buffer in module.buffers():
+            dist.broadcast(buffer, 0)
 
 
 def hidden_progress() -> bool | None:

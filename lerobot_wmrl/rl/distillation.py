@@ -20,6 +20,7 @@ from lerobot_wmrl.common.distributed import (
     hidden_progress,
     mean_over_processes,
     rank_and_size,
+    share_buffers,
 )
 from lerobot_wmrl.common.errors import FieldError, TrainingStopped
 from lerobot_wmrl.common.pipeline import Pipeline
@@ -252,6 +253,7 @@ class Distillation(RLAlgorithm):
             losses.append(loss.item())
             norms.append(norm.item())
         self.lerobot_policy.eval()
+        share_buffers(self.lerobot_policy)
         self.iteration += 1
         count = max(len(losses), 1)
         means = {"loss": sum(losses) / count, "norm": sum(norms) / count}

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -198,11 +199,13 @@ def successes(source: StartFrames) -> tuple[EpisodeTable, np.ndarray]:
 
 
 def require_memory(source: StartFrames, frame_shapes: Mapping[str, tuple[int, int, int]]) -> None:
-    """Raise FieldError if the frames of `recorded_successes` do not fit into the free memory."""
+    """Raise FieldError if the frames of `recorded_successes`, of which each process of `torchrun` on this
+    machine has its own, do not fit into the free memory."""
     if not source.given:
         return
     table, episodes = successes(source)
-    size = int(table.length[episodes].sum()) * sum(map(math.prod, frame_shapes.values()))
+    processes = int(os.environ.get("LOCAL_WORLD_SIZE", 1))
+    size = processes * int(table.length[episodes].sum()) * sum(map(math.prod, frame_shapes.values()))
     free = psutil.virtual_memory().available
     if size > free:
         raise FieldError(

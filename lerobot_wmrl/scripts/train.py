@@ -27,7 +27,13 @@ from lerobot.configs.policies import PreTrainedConfig
 
 from lerobot_wmrl.common.command_line import run_command
 from lerobot_wmrl.common.constants import Observation
-from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process, rank_and_size, wait_for_all
+from lerobot_wmrl.common.distributed import (
+    LONGEST_WAIT,
+    is_first_process,
+    part_random_numbers,
+    rank_and_size,
+    wait_for_all,
+)
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.output_folders import Claim
 from lerobot_wmrl.common.policies import LoadedPolicy
@@ -131,6 +137,7 @@ def train_in(env: TensorEnv, cfg: TrainConfig, claim: Claim, policy: LoadedPolic
     if cfg.peft is not None:
         policy.policy = with_new_adapters(policy.policy, cfg.peft)
     algorithm = make_algorithm(policy.policy, cfg.algorithm, cfg.output_dir)
+    part_random_numbers(cfg.seed)  # of which the distilled policy's loss draws some
     pipeline = make_pipeline(config, *policy.processors, shown=compacted(env))
     if isinstance(algorithm, Distillation):
         algorithm.check_recorded(env, pipeline)

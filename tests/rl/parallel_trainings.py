@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "rl"))
 from chunk_policy import ACTIONS, ChunkPolicy, Sample
 from point_env import PointEnv
 
-from lerobot_wmrl.common.distributed import rank_and_size
+from lerobot_wmrl.common.distributed import part_random_numbers, rank_and_size, share_buffers
 from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.rl.callbacks import Record
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig, PPOConfig
@@ -104,4 +104,10 @@ if __name__ == "__main__":
     PartialState(cpu=True, timeout=timedelta(minutes=4))  # for a process to wait for the other
     for each in RUNS:
         run(each, Path(sys.argv[1]) / each)
+    rank, module = rank_and_size()[0], torch.nn.BatchNorm1d(2)
+    torch.manual_seed(0)
+    part_random_numbers(0)
+    module(torch.rand(8, 2))
+    share_buffers(module)
+    torch.save((torch.rand(3), module.running_mean), Path(sys.argv[1]) / f"apart-{rank}.pt")
     PartialState().destroy_process_group()

@@ -45,6 +45,7 @@ from lerobot_wmrl.rl.labels import (
     imagined_labels,
     recorded_successes,
     require_memory,
+    successes,
 )
 from lerobot_wmrl.rl.observations import ObservationBuffer
 from lerobot_wmrl.scripts.train import main
@@ -236,8 +237,11 @@ def test_recorded_successes_are_labels_as_lerobots_datasets_give_them(
 def test_recorded_frames_that_do_not_fit_into_memory_are_refused(
     small_dataset: LeRobotDataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=1000))
     source, camera = StartFrames(root=str(small_dataset.root)), "observation.images.third_view"
+    size = successes(source)[0].length[successes(source)[1]].sum() * 3 * 32 * 32
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=size))
+    require_memory(source, {camera: (3, 32, 32)})
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
     with pytest.raises(FieldError, match=r"recorded=True: .* 0.0 GB of memory, and 0.0 GB are free"):
         require_memory(source, {camera: (3, 32, 32)})
 

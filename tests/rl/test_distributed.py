@@ -52,6 +52,20 @@ def test_two_processes_learn_what_one_does(name: str, trained_twice: tuple[Path,
         torch.testing.assert_close(two[key], value, rtol=1e-4, atol=1e-6)
 
 
+def test_processes_draw_numbers_of_their_own_and_have_the_first_one_s_buffers(
+    trained_twice: tuple[Path, Path],
+) -> None:
+    torch.manual_seed(0)
+    module = torch.nn.BatchNorm1d(2)
+    module(torch.rand(8, 2))
+    alone = torch.rand(3)
+    (first, mean), (second, other) = (torch.load(trained_twice[1] / f"apart-{rank}.pt") for rank in range(2))
+    torch.testing.assert_close(first, alone)
+    assert not torch.isclose(second, first).any()
+    torch.testing.assert_close(other, mean, rtol=0, atol=0)
+    torch.testing.assert_close(mean, module.running_mean, rtol=0, atol=0)
+
+
 def test_a_run_goes_on_with_as_many_processes_as_it_began_with(trained_twice: tuple[Path, Path]) -> None:
     with pytest.raises(ValueError, match=r"began with 2 processes, here are 1; .*--nproc_per_node=2"):
         run("grpo", trained_twice[1] / "grpo")
