@@ -23,7 +23,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.precision import imagination_dtype, keep_freed_memory
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
-from lerobot_wmrl.rl.configuration_distillation import fast_planner
+from lerobot_wmrl.rl.configuration_distillation import FastPlanner
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 from lerobot_wmrl.world_models.planning import Planner
@@ -38,7 +38,7 @@ PLANS_AN_EPISODE: Final = 4
 
 SETTINGS: Final = {
     "wm_mpc": PlannerSettings(),
-    "distillation": fast_planner(),
+    "distillation": FastPlanner(),
     "near_a_policy": PlannerSettings(horizon=28, samples=16, elites=4, iterations=2, spread=0.5),
 }
 

@@ -11,9 +11,14 @@ from lerobot_wmrl.rl.configuration_algorithms import AlgorithmConfig
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 
 
-def fast_planner() -> PlannerSettings:
-    """Return settings of a planner that is asked some hundred times."""
-    return PlannerSettings(horizon=28, samples=48, iterations=2, spread=0.5)
+@dataclass
+class FastPlanner(PlannerSettings):
+    """A planner that is asked some hundred times."""
+
+    horizon: int = 28
+    samples: int = 48
+    iterations: int = 2
+    spread: float = 0.5
 
 
 @RLAlgorithmConfig.register_subclass("distillation")
@@ -36,7 +41,7 @@ class DistillationConfig(AlgorithmConfig):
         batch_size: labels in an optimizer step, in each process of `torchrun`.
     """
 
-    planner: PlannerSettings = field(default_factory=fast_planner)
+    planner: FastPlanner = field(default_factory=FastPlanner)
     longest_lead: int = 16
     updates: int = 150
     last_updates: int = 1000

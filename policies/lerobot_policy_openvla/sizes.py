@@ -65,12 +65,20 @@ class LlamaSizes:
 
 
 @dataclass
+class DinoSizes(ViTSizes):
+    """Sizes of DINOv2, whose images have a class token and registers beside their patches."""
+
+    class_token: bool = True
+    registers: int = 4
+
+
+@dataclass
 class Sizes:
     """Sizes of the whole model. By default small enough for two CPU cores."""
 
     image_size: int = 64
     patch_size: int = 8
-    dino: ViTSizes = field(default_factory=lambda: ViTSizes(class_token=True, registers=4))
+    dino: DinoSizes = field(default_factory=DinoSizes)
     siglip: ViTSizes = field(default_factory=ViTSizes)
     llama: LlamaSizes = field(default_factory=LlamaSizes)
 
@@ -89,7 +97,7 @@ class Sizes:
 RELEASED: Final = Sizes(
     image_size=224,
     patch_size=14,
-    dino=ViTSizes(width=1024, depth=24, heads=16, mlp_size=4096, class_token=True, registers=4),
+    dino=DinoSizes(width=1024, depth=24, heads=16, mlp_size=4096),
     siglip=ViTSizes(width=1152, depth=27, heads=16, mlp_size=4304),
     llama=LlamaSizes(width=4096, depth=32, heads=32, kv_heads=32, mlp_size=11008, vocab_size=32064),
 )
@@ -122,8 +130,8 @@ def sizes_from_weights(shapes: Shapes, config: Mapping[str, Any], heads: Mapping
     return Sizes(
         image_size=math.isqrt(patches) * patch_size,
         patch_size=patch_size,
-        dino=_vit_sizes(shapes, DINO, heads),
-        siglip=_vit_sizes(shapes, SIGLIP, heads),
+        dino=_vit_sizes(DinoSizes, shapes, DINO, heads),
+        siglip=_vit_sizes(ViTSizes, shapes, SIGLIP, heads),
         llama=_llama_sizes(shapes, config),
     )
 
@@ -135,10 +143,12 @@ def shape_of(shapes: Shapes, name: str) -> tuple[int, ...]:
     return shapes[name]
 
 
-def _vit_sizes(shapes: Shapes, prefix: str, heads: Mapping[str, int]) -> ViTSizes:
+def _vit_sizes[VitSizes: ViTSizes](
+    kind: type[VitSizes], shapes: Shapes, prefix: str, heads: Mapping[str, int]
+) -> VitSizes:
     width = shape_of(shapes, f"{prefix}patch_embed.proj.weight")[0]
     registers = shapes.get(f"{prefix}reg_token", (1, 0, width))[1]
-    return ViTSizes(
+    return kind(
         width=width,
         depth=_depth(shapes, f"{prefix}blocks."),
         heads=heads.get(prefix) or vit_heads(prefix, width),

@@ -1,15 +1,18 @@
 """Configuration of the imagined robot, `--robot.type=imagined`."""
 
 from dataclasses import dataclass, field
-from typing import Final
 
 from lerobot.robots import RobotConfig
 
 from lerobot_wmrl.common.errors import FieldError, require_positive
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 
-MAX_STARTS: Final = 100_000
-"""Episodes begin in the first frame of every episode of a dataset with so many at most."""
+
+@dataclass
+class EveryStart(StartFrames):
+    """The first frames of every episode of a dataset, where it has not more than these."""
+
+    max_starts: int = 100_000
 
 
 @RobotConfig.register_subclass("imagined")
@@ -38,7 +41,7 @@ class ImaginedRobotConfig(RobotConfig):
     """
 
     world_model_path: str = ""
-    dataset: StartFrames = field(default_factory=lambda: StartFrames(max_starts=MAX_STARTS))
+    dataset: EveryStart = field(default_factory=EveryStart)
     first_start: int = 0
     episode_time_s: float | None = None
     done_threshold: float = 0.5

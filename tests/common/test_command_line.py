@@ -1,11 +1,21 @@
 """Fields become the flags that were typed, and flags that do not exist lead to those that do."""
 
-from dataclasses import dataclass, field
+import importlib
+import pkgutil
+from collections.abc import Iterator
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from pathlib import Path
+from typing import Any, get_type_hints
 
+import draccus
 import pytest
-from lerobot.configs import parser
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs.rewards import RewardModelConfig
+from lerobot.envs.configs import EnvConfig
+from lerobot.rl.algorithms.configs import RLAlgorithmConfig
+from lerobot.robots import RobotConfig
 
+from lerobot_wmrl import scripts
 from lerobot_wmrl.common.command_line import (
     GivenPath,
     RunConfig,
@@ -167,3 +177,37 @@ def test_a_setting_that_another_version_lacks_is_off_there():
         "env.new None → 3"
     ]
     assert different_settings({"real": None}, {"real": {"type": "pusht"}}, ()) == ["real.type None → 'pusht'"]
+
+
+def every_config() -> list[type]:
+    """The configuration of every command, policy, reward model, environment, algorithm and robot of ours."""
+    for _, name, _ in pkgutil.iter_modules(scripts.__path__, f"{scripts.__name__}."):
+        importlib.import_module(name)
+    importlib.import_module("lerobot_dataset_maniskill.record")
+    importlib.import_module("lerobot_robot_imagined.config_imagined")
+    bases = PreTrainedConfig, RewardModelConfig, EnvConfig, RLAlgorithmConfig, RobotConfig
+    known = [each for base in bases for each in base.get_known_choices().values()]
+    ours = "lerobot_wmrl", "lerobot_policy", "lerobot_robot", "lerobot_dataset"
+    return [each for each in (*RunConfig.__subclasses__(), *known) if each.__module__.startswith(ours)]
+
+
+def nested(config_class: type, seen: set[type]) -> Iterator[tuple[str, type, Any]]:
+    """Yield the settings that are settings themselves: their names, declared types and defaults."""
+    hints = get_type_hints(config_class)
+    for each in fields(config_class):
+        declared = hints[each.name]
+        if not is_dataclass(declared) or declared in seen or draccus.utils.is_choice_type(declared):
+            continue
+        if each.default_factory is not MISSING:
+            yield f"{config_class.__name__}.{each.name}", declared, each.default_factory()
+        yield from nested(declared, seen | {declared})
+
+
+def test_a_setting_that_is_given_changes_no_other_one() -> None:
+    """Where one setting of several is given, draccus takes the others from the class, not from what the field
+    makes by default."""
+    found = [each for config in every_config() if is_dataclass(config) for each in nested(config, set())]
+    assert {"Sizes.dino", "DistillationConfig.planner", "ImaginedRobotConfig.dataset"} <= {
+        name for name, *_ in found
+    }
+    assert [name for name, declared, default in found if default != declared()] == []

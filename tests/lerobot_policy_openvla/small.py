@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
-from lerobot_policy_openvla.sizes import LlamaSizes, Sizes, ViTSizes
+from lerobot_policy_openvla.sizes import DinoSizes, LlamaSizes, Sizes, ViTSizes
 
 CAMERA = "observation.images.third_view"
 ACTIONS = 3
@@ -17,7 +17,7 @@ LONG, SHORT = "push the red cube as far forward as it goes", "push"
 SMALL_SIZES = Sizes(
     image_size=32,
     patch_size=16,
-    dino=ViTSizes(width=16, depth=3, heads=1, mlp_size=32, class_token=True, registers=2),
+    dino=DinoSizes(width=16, depth=3, heads=1, mlp_size=32, registers=2),
     siglip=ViTSizes(width=32, depth=2, heads=2, mlp_size=48),
     llama=LlamaSizes(width=32, depth=2, heads=4, kv_heads=2, mlp_size=48, vocab_size=640),
 )
