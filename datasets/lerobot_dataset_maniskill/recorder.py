@@ -175,5 +175,5 @@ def merge(source: Source, work: Path, root: Path, repo_id: str) -> None:
     if problem := find_damage(merged, sum(source.parts.values())):
         raise ValueError(f"{work}: merging failed: {problem}; remove the folder and record again")
     report = source.describe(merged)
-    merged.replace(root)
+    merged.replace(root.resolve())
     print(report)

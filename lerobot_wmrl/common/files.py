@@ -26,8 +26,10 @@ def write_text(path: Path, text: str) -> None:
 def whole_folder(target: Path) -> Iterator[Path]:
     """Give a folder beside `target` to fill, which does not exist yet; rename it when it is whole.
 
-    `target` must be empty or not exist. What a torn call left is removed by the next one.
+    `target` must be empty or not exist; of a link that holds for what it points to. What a torn call left is
+    removed by the next one.
     """
+    target = target.resolve()
     partial = target.with_name(f".{target.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.parent.mkdir(parents=True, exist_ok=True)
@@ -39,6 +41,11 @@ def require_new(field: str, target: Path) -> None:
     """Raise FieldError if there is something at `target` already, other than an empty folder."""
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise FieldError(field, target, "there is something already", "choose a new folder")
+    if target.is_mount():
+        raise FieldError(
+            field, target, "a disk is mounted there, and a whole folder cannot take its place",
+            "choose a folder in it",
+        )  # fmt: skip
 
 
 def foreign_files(folder: Path, *allowed: str) -> bool:

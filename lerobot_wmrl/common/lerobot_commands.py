@@ -3,12 +3,13 @@ environments as flags."""
 
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import Any
 
 import draccus
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
-from lerobot.utils.utils import flatten_dict
 
 from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, step_folders
 from lerobot_wmrl.common.presets import Flags, format_flags
@@ -55,12 +56,24 @@ def edit_advice(root: str | Path, operation: str, flags: Flags) -> str:
     return shlex.join(edit_command(source.with_name(f"{source.name}_edited"), operation, flags))
 
 
+def flat(settings: Any, encoded: Mapping[str, Any]) -> dict[str, Any]:
+    """Return encoded settings by their flags' names; those that are mappings stay whole, as one flag each."""
+    found: dict[str, Any] = {}
+    for name, value in encoded.items():
+        part = getattr(settings, name, None)
+        if is_dataclass(part):
+            found |= {f"{name}.{inner}": each for inner, each in flat(part, value).items()}
+        else:
+            found[name] = value
+    return found
+
+
 def env_flags(env: EnvConfig, prefix: str = "env") -> Flags:
     """Return `env.type` and the settings that differ from their defaults, as a command takes them.
 
     prefix: prefix of the flags, `env` or `real_env`.
     """
-    given, default = (flatten_dict(draccus.encode(each, EnvConfig), sep=".") for each in (env, type(env)()))
+    given, default = (flat(each, draccus.encode(each, EnvConfig)) for each in (env, type(env)()))
     differing = [name for name in given if given[name] != default.get(name)]
     chosen = {
         name

@@ -1,6 +1,7 @@
 """The commands of an improvement, as a user would type them: one of each stage, and two to go on with."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from math import ceil
 from pathlib import Path
@@ -14,6 +15,7 @@ from lerobot_wmrl.common.lerobot_commands import edit_command, env_flags, merge_
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.stages import Stage, never
 from lerobot_wmrl.data.dataset import DatasetSource
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET
 from lerobot_wmrl.improve.learnt import MAX_STARTS
 from lerobot_wmrl.improve.plan import Plan
@@ -242,9 +244,11 @@ def sized_command(plan: Plan, program: str, flags: Flags) -> list[str]:
 
 
 def drive(progress: Progress) -> list[str]:
-    """Return the command that shows the world model in the browser."""
-    plan = progress.plan
-    real = {} if plan.config.real_env is None else real_env(plan, "real_env")
+    """Return the command that shows the world model in the browser, of several tasks with the first one."""
+    plan, env = progress.plan, progress.plan.config.real_env
+    if isinstance(env, WmrlManiSkillEnv):
+        env = replace(env, task=env.task_names[0])
+    real = {} if env is None else env_flags(env, "real_env")
     return ["lerobot-wmrl-play", *format_flags({
         "world_model.path": str(plan.out / "world_model"), **DatasetSource.flags(plan.data),
         "policy.path": progress.policies[progress.chosen()], **real, **progress.criterion(),

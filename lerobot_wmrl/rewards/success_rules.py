@@ -66,7 +66,7 @@ class FirstFramesRule(SuccessRule):
     first: dict[int, int] | None = None
 
     def labels(self, dataset: "LeRobotDataset") -> np.ndarray:
-        episode, frame, length = frame_positions(dataset)
+        episode, *_ = frame_positions(dataset)
         if self.first is None:
             raise FieldError(
                 "first", None, "names no episode that succeeds", "name those that do, or {} if none does"
@@ -79,13 +79,13 @@ class FirstFramesRule(SuccessRule):
         require_episodes("first", self.first, dataset)
         solved = np.zeros(len(episode), bool)
         for index, first in self.first.items():
-            rows = episode == index
-            if not 0 <= first < length[rows][0]:
+            begin, end = np.searchsorted(episode, (index, index + 1))
+            if not 0 <= first < end - begin:
                 raise FieldError(
                     "first", self.first, f"episode {index} has no frame {first}",
-                    f"its frames are 0 to {length[rows][0] - 1}",
+                    f"its frames are 0 to {end - begin - 1}",
                 )  # fmt: skip
-            solved |= rows & (frame >= first)
+            solved[begin + first : end] = True
         return next_frame_solved(solved, dataset)
 
 

@@ -65,8 +65,8 @@ def label(cfg: LabelConfig) -> None:
     success = cfg.success.labels(dataset)
     with writing("output_dir", cfg.output_dir, resumes=False):
         write_labelled(dataset, success, cfg.output_dir, cfg.repo_id or f"local/{cfg.output_dir.name}")
-    episode, *_ = frame_positions(dataset)
-    runs = [longest_run(success[episode == index]) for index in np.unique(episode)]
+    _, frame, _ = frame_positions(dataset)
+    runs = [longest_run(rows) for rows in np.split(success, np.flatnonzero(frame == 0)[1:])]
     print("\n".join(report(runs, cfg)))
 
 

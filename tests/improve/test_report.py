@@ -6,6 +6,7 @@ import re
 import shlex
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +19,7 @@ from PIL import Image
 
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.tracking import append_metrics
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 from lerobot_wmrl.improve import commands
 from lerobot_wmrl.improve.learnt import LearntEpisodes
@@ -178,6 +180,12 @@ def test_a_success_in_imagination_is_said_to_be_a_belief(finished: Progress) -> 
 
 
 @pytest.mark.usefixtures("without_drawing")
+def test_one_of_several_tasks_is_driven(finished: Progress) -> None:
+    config = replace(finished.plan.config, real_env=WmrlManiSkillEnv(task="pull,push"))
+    several = replace(finished, plan=replace(finished.plan, config=config))
+    assert "--real_env.task=pull" in commands.drive(several)
+
+
 def test_the_command_that_drives_the_world_model_takes_its_flags(finished: Progress) -> None:
     finished.plan.config.dataset.episodes = [0, 2]
     command = shlex.join(commands.drive(finished))

@@ -6,14 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+import draccus
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs.configs import LiberoEnv
 
 from lerobot_wmrl.common.checkpoints import model_folder
 from lerobot_wmrl.common.constants import GATE_SEED
 from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.lerobot_commands import env_flags
+from lerobot_wmrl.common.presets import format_flags
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import read_episodes
@@ -24,6 +27,7 @@ from lerobot_wmrl.evaluation.outcomes import labelled_recording, predict_outcome
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl import recorders
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
+from lerobot_wmrl.rl.configuration_train import TrainConfig
 from lerobot_wmrl.rl.gate import SuccessGate
 from lerobot_wmrl.rl.recorders import ManiSkillRecorder
 from lerobot_wmrl.world_models.checkpoint import load_model
@@ -155,6 +159,15 @@ def test_the_recorder_gets_what_is_not_as_by_default() -> None:
         "env.type": "wmrl_maniskill", "env.task": "pull", "env.scenes": [0, 2], "env.image_size": 64,
         "env.cameras": ["wrist"],
     }  # fmt: skip
+
+
+def test_settings_that_are_mappings_are_given_whole() -> None:
+    """A flag a key would be one that the environment does not have."""
+    cameras = {"agentview_image": "front", "robot0_eye_in_hand_image": "wrist"}
+    flags = format_flags(env_flags(LiberoEnv(camera_name_mapping=cameras), "real_env"))
+    read = draccus.parse(TrainConfig, args=flags).real_env
+    assert isinstance(read, LiberoEnv)
+    assert read.camera_name_mapping == cameras
 
 
 def test_a_recording_in_a_batched_maniskill_has_a_simulation_in_each_worker(
