@@ -3,9 +3,9 @@
 from typing import Final
 
 from experiments.cells import Load
-from experiments.from_one_policy import tables
+from experiments.from_one_policy import changes, tables
 from experiments.study import ROOT, read_cells
-from experiments.value_cells import SCENES, against, published
+from experiments.value_cells import SCENES, against, groups, published
 from experiments.value_sections import controls
 from lerobot_wmrl.common.files import markdown_table as table
 
@@ -13,6 +13,9 @@ STUDY: Final = "value_act"
 CONTROLS_STUDY: Final = "value_act_controls"
 BEFORE: Final = "filtered"
 """What all others begin from."""
+
+RIVAL: Final = "longer_filtered"
+"""The best use of the same recordings without a world model."""
 
 TITLES: Final = {
     BEFORE: "filtered BC, 3,000 steps",
@@ -34,8 +37,11 @@ decided on the starts of seed 0, before PPO was measured."""
 
 
 def section(load: Load) -> str:
-    """Return the section: success after every method, and what each gains on the policy before it."""
-    return f"{tables(load, STUDY, TITLES, BEFORE)}\n\n{LIMITS}"
+    """Return the section: success after every method, and what each gains on BC, of both lengths."""
+    cells = [cell for each in groups(load, STUDY, ()).values() for cell in each if RIVAL in cell["methods"]]
+    stronger = {name: TITLES[name] for name in TITLES if name != BEFORE}
+    against_it = f"{changes(cells, stronger, RIVAL)}\n\n" if cells else ""
+    return f"{tables(load, STUDY, TITLES, BEFORE)}\n\n{against_it}{LIMITS}"
 
 
 def controls_section(load: Load) -> str:

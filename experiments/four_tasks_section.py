@@ -42,7 +42,8 @@ COMPARED: Final = (
 
 LIMITS: Final = """\
 The world model is not told the task: it knows it if the first frame shows it. (Today's
-[reads the instruction](#instructions).) The done threshold was chosen
+[reads the instruction](#instructions).) By two seeds no interval says what another would
+give: read the gains by seed. The done threshold was chosen
 on these held-out rollouts of seed 0: a first run of PPO with 0.9, at which no success of pick_place and
 move_to_aim is recognised, was ended unmeasured. The world model and filtered BC learnt on a GPU, where the
 frames came compressed as video (H.264, 4:4:4): what that changes of the filtered policy's actions is 7 % of

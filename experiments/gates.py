@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from experiments import figures
+from experiments import figures, value
 from experiments.study import Study
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.world_models.checkpoint import load_model
@@ -68,6 +68,24 @@ def instructions(study: Study) -> Results:
     }
     settings = {name: study.variables[name] for name in ("demonstrations", "rollouts", "seed", "judged")}
     return {study.variables["cell"]: {**settings, "reads": rates}}
+
+
+def codes(study: Study) -> Results:
+    """Quantizers under a world model, PPO in each, and success decided by the goal frame."""
+    settings = {name: study.variables[name] for name in ("demonstrations", "rollouts", "seed", "starts")}
+    methods: dict[str, Any] = study.variables["methods"]
+    found = {
+        **settings,
+        "judged": study.variables["judged"],
+        "real_successes": value.successes(study.folder / "dataset"),
+        "methods": {name: value.method(study, name, steps) for name, steps in methods.items()},
+        "gates": {
+            kind: {domain: kept(study, f"gate_{kind}_{domain}") for domain in study.variables["domains"]}
+            for kind in study.variables["kinds"]
+        },
+        "goal_distance": json.loads((study.folder / "goal_distance.json").read_text()),
+    }
+    return {study.variables["cell"]: found}
 
 
 def variants(study: Study) -> Results:

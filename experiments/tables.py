@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from experiments import (
     act_section,
+    codes_section,
     foreign,
     four_tasks_section,
     judged,
@@ -99,6 +100,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "reward_curves": ("Trust", world_models.reward_curves),
     "four_tasks": ("World models", world_models.four_tasks),
     "instructions": ("World models", world_models.instructions),
+    "codes": ("World models", codes_section.section),
     "learning_curve": ("World models", world_models.learning_curve),
     "text_dynamics": ("World models", world_models.text_dynamics),
     "ablation": ("World models", world_models.ablation),
@@ -121,8 +123,9 @@ Each section is a question, its answer, one table and its limits. The page is ge
 - Success is success in ManiSkill unless a column says otherwise. *Known* scenes are those that policies and
   world model were trained in; *unseen* ones are in no training data. Starts are held out in both.
 - Intervals in parentheses are 95 %: Wilson's for a share, bootstrap over episodes for a mean, bootstrap over
-  starts for a change and in the studies of what imagination is worth. They cover other seeds of training
-  where a table shows several seeds and their mean (bootstrap over starts and seeds), and nowhere else.
+  starts for a change and in the studies of what imagination is worth. Where a table shows several seeds
+  and their mean, seeds are drawn too, but of two or three such intervals are too narrow for other seeds: read
+  the gains by seed. Scenes are not drawn.
 - All numbers come from CPUs but those of [speed_gpu](#speed_gpu) and where a GPU is named under the table,
   and all from earlier commits than the present one. The commit is under each table; *before* means that only
   the commit that added the numbers is known. Today's studies repeat the set-up, but not all have been run

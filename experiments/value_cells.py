@@ -156,10 +156,14 @@ def gains(cells: Sequence[Cell], method: str, baseline: str, domain: str) -> lis
     return [mean([cell], method, domain) - mean([cell], baseline, domain) for cell in both]
 
 
+def complete(cells: Sequence[Cell], methods: Iterable[str]) -> list[str]:
+    """Return the methods that have been run in all of the cells."""
+    return [method for method in methods if all(method in cell["methods"] for cell in cells)]
+
+
 def best(cells: Sequence[Cell], methods: Sequence[str], domain: str) -> str:
     """Return the method with the highest mean success, of those that have been run in all cells."""
-    complete = [method for method in methods if all(method in cell["methods"] for cell in cells)]
-    return max(complete, key=lambda method: mean(cells, method, domain))
+    return max(complete(cells, methods), key=lambda method: mean(cells, method, domain))
 
 
 def best_pair(cells: Sequence[Cell], domain: str) -> tuple[str, str]:

@@ -115,11 +115,11 @@ def aims(found: Groups) -> str:
             planner.append(f"{spoken(budget)}, in {minutes(cells, 'ppo_distilled')} minutes")
     known, unseen = (f"{100 * rate:.0f}" for rate in AIMED_SUCCESS)
     return f"""We had aimed at {100 * AIMED_GAIN:.0f} points more than the best method without a world model,
-in known and in unseen scenes, with two of three numbers of demonstrations. It is so with {listed(above)}
-alone, where the best of those is BC trained for longer, which was not run with every budget. With more
-demonstrations or rollouts, less is left to gain: the best method without one reaches up to
-{100 * most:.0f} % in known scenes. Of the planner distilled after PPO we had expected {known} and {unseen} %
-within 30 minutes. It reaches both rates with {listed(planner)}."""
+in known and in unseen scenes, with two of three numbers of demonstrations. The means reach that with
+{listed(above)} alone (for what seeds bear out see below), where the best of those is BC trained for longer,
+which was not run with every budget. With more demonstrations or rollouts, less is left to gain: the best
+method without one reaches up to {100 * most:.0f} % in known scenes. Of the planner distilled after PPO we
+had expected {known} and {unseen} % within 30 minutes. It reaches both rates with {listed(planner)}."""
 
 
 def listed(parts: Sequence[str]) -> str:

@@ -143,7 +143,7 @@ def instructions(load: Load) -> str:
         for reads in ("true", "false")
         for name in TOLD
     }
-    return f"""Under the instruction that was followed it makes no measurable difference: false
+    return f"""Under the instruction that was followed no difference is shown (one seed, tasks pooled): false
 positives {totals["true", "false_positive_rate"]} with it and
 {totals["false", "false_positive_rate"]} without, recall
 {totals["true", "recall"]} and {totals["false", "recall"]}. Under the instruction of another task, drawn from

@@ -83,7 +83,7 @@ def test_aims_and_other_episodes_are_said(docs: Path, k: int, reached: str) -> N
         write_json(whole, content)
     load = loader(docs)
     text = " ".join(f"{aims(groups(load))} {recorded_anew(groups(load), 'ppo_distilled')}".split())
-    assert f"It is so with {reached} alone" in text
+    assert f"The means reach that with {reached} alone" in text
     planner = f"{reached}, in 40 minutes" if k == 10 else reached
     assert f"It reaches both rates with {planner}." in text
     assert "300 rollouts, seed 100000 (101 successes, the others 100)" in text
