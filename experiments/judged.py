@@ -227,7 +227,8 @@ imagined frames. *Calibrated* is by the line through the policies of all other t
 in the world model (two of these nine, `cloned` and `cloning`, are the same one to its 800th step, so that the
 line is a little better than it should be), whose intervals of 90 % are {100 * outside["width"]:.0f} points
 wide in known scenes. An interval by rollouts counts if the estimate and the measured rate may be equal.
-Without references the command refuses {unexplained[0]} of these policies in known and {unexplained[1]} in unseen scenes, which succeed in
+Without references the command refuses {unexplained[0]} of these policies in known and {unexplained[1]} in
+unseen scenes, which succeed in
 imagination more often than the rollouts' successes, or less often than their failures. For all of them
 together, imagined and real success differ by more than {100 * TOLERATED:.0f} points in
 {differing(known_scenes)} known scenes and in {differing(unseen_scenes)} unseen ones.
