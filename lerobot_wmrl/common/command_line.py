@@ -16,6 +16,7 @@ from types import SimpleNamespace
 from typing import Any, ClassVar, NamedTuple
 
 import draccus
+import yaml
 from draccus.utils import ParsingError
 from draccus.wrappers import docstring, field_wrapper
 from lerobot.configs import parser
@@ -37,6 +38,11 @@ from lerobot_wmrl.common.settings import (
 
 MAPPINGS = "input_features", "output_features", "normalization_mapping", "norm_stats"
 """Settings of LeRobot's policies and reward models whose value is a mapping."""
+
+TEXTS = "str", "path", "Path"
+"""Kinds of settings that are texts."""
+
+QUOTATION_MARKS = "\"'"
 
 FIELD = re.compile(r"`([\w.]+)((?:=[^`]*)?)`")
 """A field in a message, alone or with a value: `dynamics.type=anchored`."""
@@ -122,7 +128,7 @@ def run_command[Config: RunConfig](
     logging.getLogger("lerobot.configs").setLevel(logging.ERROR)
     try:
         typed = with_home(with_equals_signs(sys.argv[1:]))
-        sys.argv[1:] = expand(typed)
+        sys.argv[1:] = with_texts_as_typed(expand(typed), config_class)
         if {"--help", "-h"} & set(sys.argv[1:]):
             print(help_of(function, config_class))
             return
@@ -155,6 +161,29 @@ def with_equals_signs(argv: Sequence[str]) -> list[str]:
         else:
             written.append(argument)
     return written
+
+
+def with_texts_as_typed(argv: Sequence[str], config_class: type) -> list[str]:
+    """Write texts that YAML reads as something else, such as `0123`, `1.10` or `2024_01_15`, in quotation
+    marks: draccus reads every value as YAML, and makes another text of the number."""
+    kinds = {each.name: each.kind for each in settings_of(config_class, chosen_types(argv))}
+    parts = (argument.partition("=") for argument in argv)
+    return [f"{name}{equals}{as_typed(value, kinds.get(name[2:], ''))}" for name, equals, value in parts]
+
+
+def as_typed(value: str, kind: str) -> str:
+    """Return what a setting of a kind is written as in YAML, so that its texts stay as they are."""
+    try:
+        read = yaml.safe_load(value)
+    except yaml.YAMLError:
+        read = ...
+    if kind in TEXTS:
+        quoted = isinstance(read, str) and value[0] in QUOTATION_MARKS
+        return value if read in (None, value) or quoted else json.dumps(value, ensure_ascii=False)
+    listed = kind.startswith("list[") and kind[5:-1] in TEXTS and isinstance(read, list)
+    if listed and not all(isinstance(each, str) for each in read):
+        return format_value(yaml.load(value, yaml.BaseLoader))
+    return value
 
 
 def is_name(argument: str) -> bool:

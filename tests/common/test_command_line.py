@@ -2,6 +2,7 @@
 
 import importlib
 import pkgutil
+import sys
 from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from pathlib import Path
@@ -25,6 +26,7 @@ from lerobot_wmrl.common.command_line import (
     said_in_flags,
     with_equals_signs,
     with_home,
+    with_texts_as_typed,
 )
 from lerobot_wmrl.common.errors import FieldError, Stopped
 from lerobot_wmrl.common.output_folders import different_settings
@@ -54,6 +56,17 @@ class Config(RunConfig):
     env: Env = field(default_factory=Env)
     real: Env = field(default_factory=lambda: Env(length=60))
     iterations: int = 3
+
+
+@dataclass
+class Texts(RunConfig):
+    """Settings that are texts, and one that is not."""
+
+    folder: Path = Path()
+    text: str = ""
+    optional: str | None = None
+    texts: list[str] = field(default_factory=list)
+    number: int = 0
 
 
 @pytest.mark.parametrize(
@@ -177,6 +190,33 @@ def test_a_setting_that_another_version_lacks_is_off_there():
         "env.new None → 3"
     ]
     assert different_settings({"real": None}, {"real": {"type": "pusht"}}, ()) == ["real.type None → 'pusht'"]
+
+
+@pytest.mark.parametrize("typed", [
+    "2024-01-15", "2024_01_15", "0123", "1.10", "1e3", "a #b", "yes", "a: b", "plain", "push,pull", "[a",
+    "12:30",
+])  # fmt: skip
+def test_texts_stay_as_they_are_typed(typed: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """YAML makes dates, numbers and truth values of them."""
+    flags = [f"--{name}={typed}" for name in ("folder", "text", "optional")]
+    listed = [] if {*typed} & {*",#:["} else [f"--texts=[{typed},b]"]
+    monkeypatch.setattr(sys, "argv", ["command", *with_texts_as_typed([*flags, *listed], Texts)])
+    read = parse_flags(Texts)
+    assert (read.folder, read.text, read.optional) == (Path(typed), typed, typed)
+    assert read.texts == ([typed, "b"] if listed else [])
+
+
+def test_what_is_quoted_or_empty_or_no_text_is_left_alone() -> None:
+    given = [
+        '--text="a"',
+        "--text='1'",
+        "--optional=null",
+        "--text=",
+        "--number=3",
+        "--texts=[a,b]",
+        "--flag",
+    ]
+    assert with_texts_as_typed(given, Texts) == given
 
 
 def every_config() -> list[type]:
