@@ -13,6 +13,7 @@ from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_wmrl.common.constants import POLICY
 from lerobot_wmrl.common.errors import renamed
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.presets import flag_as_typed
 from lerobot_wmrl.data.budget import spending
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
@@ -84,8 +85,8 @@ class Rollouts:
         return (
             f"{root}: {episodes} episodes, {frames} frames ({frames / fps / 60:.1f} minutes)\n"
             f"successful: {int(table.success.sum())}/{episodes}\n"
-            f"next: lerobot-wmrl-train-world-model --model.type=frame_tokenizer --dataset.root={root} "
-            "--output_dir=outputs/frame_tokenizer"
+            "next: lerobot-wmrl-train-world-model --model.type=frame_tokenizer "
+            f"{flag_as_typed('dataset.root', root)} --output_dir=outputs/frame_tokenizer"
         )
 
     def settings(self, root: Path) -> dict[str, Any] | None:

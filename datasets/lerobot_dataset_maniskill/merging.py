@@ -12,6 +12,7 @@ from lerobot_dataset_maniskill.card import CARD_FILE, success_by_kind, write_car
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE, find_damage, write_vocabulary
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.output_folders import different_settings, require_same
+from lerobot_wmrl.common.presets import flag_as_typed
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.maniskill.embodiment import FPS
@@ -56,7 +57,7 @@ def describe(merged: Path, output_dir: Path, repo_id: str, content: Mapping[str,
         f"{output_dir}: {len(table.length)} episodes, {frames} frames ({frames / FPS / 60:.1f} minutes)\n"
         f"successful: {', '.join(rates)}\n"
         f"the card with pictures: {output_dir / CARD_FILE}\n"
-        f"next: {command} --dataset.root={output_dir} --output_dir=outputs/frame_tokenizer"
+        f"next: {command} {flag_as_typed('dataset.root', output_dir)} --output_dir=outputs/frame_tokenizer"
     )
 
 

@@ -6,6 +6,7 @@ Every file is a configuration that LeRobot's `--config_path=FILE` reads too.
 """
 
 import json
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -131,6 +132,11 @@ def _flat(content: Mapping[str, Any], whole: Sequence[str], prefix: str = "") ->
 def format_flags(settings: Mapping[str, Any]) -> list[str]:
     """Write settings as draccus parses them: `{"a.b": 1, "c": True}` → `["--a.b=1", "--c=true"]`."""
     return [f"--{name}={format_value(value)}" for name, value in settings.items()]
+
+
+def flag_as_typed(name: str, value: Any) -> str:
+    """Return a flag as one types it in a shell, whatever its value has in it: `'--dataset.root=my data'`."""
+    return shlex.join(format_flags({name: value}))
 
 
 def format_value(value: Any) -> str:

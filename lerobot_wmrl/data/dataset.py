@@ -12,6 +12,7 @@ from lerobot.datasets.utils import EPISODES_DIR, BackwardCompatibilityError
 from lerobot.utils.utils import SuppressProgressBars
 
 from lerobot_wmrl.common.errors import FieldError, first_line, renamed
+from lerobot_wmrl.common.presets import flag_as_typed
 from lerobot_wmrl.data.embodiment import whole_rate
 from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes
 
@@ -176,8 +177,8 @@ def older_format(field: str, value: object, repo_id: str, root: str | Path) -> F
     return FieldError(
         field, value, "is in a format before LeRobotDataset v3.0",
         "convert it (LeRobot converts v2.1; what is older, first by an earlier LeRobot to v2.1): "
-        f"`{script} --repo-id={repo_id} --root={root} --push-to-hub=false`, and give `dataset.root` {root}. "
-        "The old files are kept beside it",
+        f"`{script} --repo-id={repo_id} {flag_as_typed('root', root)} --push-to-hub=false`, "
+        f"and give `dataset.root` {root}. The old files are kept beside it",
     )  # fmt: skip
 
 

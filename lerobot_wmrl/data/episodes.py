@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from lerobot_wmrl.common.constants import START_TASK
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.lerobot_commands import edit_advice
+from lerobot_wmrl.common.presets import flag_as_typed
 from lerobot_wmrl.common.statistics import evenly_spaced
 
 EPISODES_A_TASK: Final = 5
@@ -264,8 +265,9 @@ def truth_of(dataset: LeRobotDataset, column: str, values: ArrayLike) -> np.ndar
         row = int(np.argmax(other))
         raise bad_row(
             dataset, column, row, f"{values[row]}, neither true nor false",
-            f"take numbers from a threshold on for true: lerobot-wmrl-label --dataset.root={dataset.root} "
-            f"--success.type=column --success.column={column} --success.threshold=…",
+            "take numbers from a threshold on for true: lerobot-wmrl-label "
+            f"{flag_as_typed('dataset.root', dataset.root)} --success.type=column "
+            f"--success.column={column} --success.threshold=…",
         )  # fmt: skip
     return values.astype(bool)
 

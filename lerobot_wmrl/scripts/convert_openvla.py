@@ -17,6 +17,7 @@ from pathlib import Path
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, renamed
 from lerobot_wmrl.common.files import require_new, whole_folder, writing
+from lerobot_wmrl.common.presets import flag_as_typed
 
 DIRECTIONS = ("import", "export")
 
@@ -61,7 +62,8 @@ def convert(cfg: ConvertOpenVLAConfig) -> None:
 def conclusion(direction: str, target: Path) -> str:
     """Say what was made and what comes next."""
     if direction == "import":
-        return f"{target}: a policy of LeRobot. Next: lerobot-eval --policy.path={target} --env.type=…"
+        policy = flag_as_typed("policy.path", target)
+        return f"{target}: a policy of LeRobot. Next: lerobot-eval {policy} --env.type=…"
     return f"{target}: a checkpoint that OpenVLA's own code loads"
 
 

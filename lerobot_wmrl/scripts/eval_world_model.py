@@ -28,7 +28,7 @@ from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least
 from lerobot_wmrl.common.output_folders import Claim
-from lerobot_wmrl.common.presets import expand_preset
+from lerobot_wmrl.common.presets import expand_preset, flag_as_typed
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
@@ -232,8 +232,8 @@ def conclusion(cfg: EvalWorldModelConfig, episodes: int, report: "Report") -> st
         verdict = "Nothing says which episodes succeeded, so the gate says nothing: use labelled rollouts."
     elif metrics["passed"]:
         verdict = (
-            "The gate is passed. Next: train a policy in it, "
-            f"lerobot-wmrl-train --env.type=world_model --env.world_model_path={cfg.model.path} …"
+            "The gate is passed. Next: train a policy in it, lerobot-wmrl-train --env.type=world_model "
+            f"{flag_as_typed('env.world_model_path', cfg.model.path)} …"
         )
     elif (metrics["false_positive_rate"]["share"] or 0) > MAX_FALSE_POSITIVE_RATE:
         verdict = (

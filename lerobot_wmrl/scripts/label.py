@@ -27,6 +27,7 @@ from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import require_new, whole_folder, writing
 from lerobot_wmrl.common.lerobot_commands import edit_advice
+from lerobot_wmrl.common.presets import flag_as_typed
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import SUCCESS
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
@@ -139,8 +140,8 @@ def report(runs: Sequence[int], cfg: LabelConfig) -> list[str]:
     if not len(held):
         lines.append("There is no success: a world model learns no reward from this dataset alone.")
     lines.append(
-        f"Next: lerobot-wmrl-train-world-model --preset=cpu --model.type=frame_tokenizer "
-        f"--dataset.root={cfg.output_dir} …"
+        "Next: lerobot-wmrl-train-world-model --preset=cpu --model.type=frame_tokenizer "
+        f"{flag_as_typed('dataset.root', cfg.output_dir)} …"
     )
     return lines
 

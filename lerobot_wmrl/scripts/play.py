@@ -24,6 +24,7 @@ The page is served to this machine alone. With another `--host`, visitors need t
 is printed.
 """
 
+import shlex
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -178,7 +179,7 @@ def export(world: "World", folder: Path, starts: int) -> None:
         agreement = export_page(world, folder, starts)
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     print(f"{folder}: {size / 1e6:.1f} MB; {agreement}")
-    print(f"look at it: python -m http.server --directory {folder} --bind 127.0.0.1")
+    print(f"look at it: python -m http.server --directory {shlex.quote(str(folder))} --bind 127.0.0.1")
 
 
 def main() -> None:

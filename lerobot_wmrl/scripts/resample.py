@@ -20,6 +20,7 @@ import numpy as np
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.lerobot_commands import edit_advice
+from lerobot_wmrl.common.presets import flag_as_typed
 from lerobot_wmrl.data.dataset import DatasetSource, save_episode
 from lerobot_wmrl.data.episodes import SUCCESS_COLUMNS
 
@@ -71,7 +72,7 @@ def resample(cfg: ResampleConfig) -> None:
     print(
         f"{cfg.output_dir}: {len(table.length)} episodes, {frames} frames at {dataset.fps // cfg.every} Hz, "
         f"the longest has {-(-int(table.length.max()) // cfg.every)}.\n"
-        f"Next: lerobot-train --dataset.root={cfg.output_dir} …"
+        f"Next: lerobot-train {flag_as_typed('dataset.root', cfg.output_dir)} …"
     )
 
 

@@ -253,25 +253,17 @@ def quality(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> str:
 
 def next_command(cfg: TrainWorldModelConfig) -> str:
     """Return the command that usually follows."""
-    data, folder = shlex.join(format_flags(cfg.dataset.flags())), cfg.output_dir.parent
+    data, folder = format_flags(cfg.dataset.flags()), cfg.output_dir.parent
+    evaluate, world_model = "lerobot-wmrl-eval-world-model", folder / "action_world_model"
     if cfg.model.type == "frame_tokenizer":
-        flags = [
-            *cfg.typed_preset,
-            "--model.type=action_world_model",
-            f"--model.tokenizer_path={cfg.output_dir}",
-        ]
-        return (
-            f"lerobot-wmrl-train-world-model {shlex.join(flags)} {data} "
-            f"--output_dir={folder / 'action_world_model'}"
-        )
-    if cfg.model.type == "text_world_model":
-        return (
-            f"lerobot-wmrl-eval-world-model --model.path={folder / 'action_world_model'} "
-            f"--text_model.path={cfg.output_dir} {data} --output_dir={folder / 'check'}"
-        )
-    return (
-        f"lerobot-wmrl-eval-world-model --model.path={cfg.output_dir} {data} --output_dir={folder / 'check'}"
-    )
+        kind = ["--model.type=action_world_model", f"--model.tokenizer_path={cfg.output_dir}"]
+        command, new = ["lerobot-wmrl-train-world-model", *cfg.typed_preset, *kind], world_model
+    elif cfg.model.type == "text_world_model":
+        models = [f"--model.path={world_model}", f"--text_model.path={cfg.output_dir}"]
+        command, new = [evaluate, *models], folder / "check"
+    else:
+        command, new = [evaluate, f"--model.path={cfg.output_dir}"], folder / "check"
+    return shlex.join([*command, *data, f"--output_dir={new}"])
 
 
 def main() -> None:

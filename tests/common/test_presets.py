@@ -1,5 +1,6 @@
 """Presets: files that stand for flags, that every command can parse and that LeRobot reads by itself."""
 
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from lerobot.configs.train import TrainPipelineConfig
 
 import lerobot_env_wmrl  # noqa: F401
 from lerobot_wmrl.common import presets
-from lerobot_wmrl.common.presets import expand_preset, format_flags, presets_of, read_settings
+from lerobot_wmrl.common.presets import expand_preset, flag_as_typed, format_flags, presets_of, read_settings
 from lerobot_wmrl.demo.stages import DemoConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig
@@ -124,3 +125,10 @@ def test_lists_are_parsed_as_they_were_written(text: str) -> None:
 def test_the_demos_defaults_are_those_of_its_preset() -> None:
     """`--preset=demo` and no preset are the same."""
     assert DemoConfig(**presets.preset_settings("demo", "demo")) == DemoConfig()
+
+
+def test_a_flag_is_one_word_of_a_shell() -> None:
+    for root in ("data/push", "my data/it's $HOME"):
+        assert shlex.split(f"command {flag_as_typed('dataset.root', Path(root))}")[1:] == [
+            f"--dataset.root={root}"
+        ]
