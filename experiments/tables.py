@@ -27,6 +27,7 @@ from experiments import (
     value_figure,
 )
 from experiments import policy_sections as policies
+from experiments import speed_sections as speed
 from experiments import value_sections as value
 from experiments import world_model_sections as world_models
 from experiments.cells import Load
@@ -106,12 +107,12 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "text_dynamics": ("World models", world_models.text_dynamics),
     "ablation": ("World models", world_models.ablation),
     "ablation_network": ("World models", world_models.ablation_network),
-    "planners": ("Recording, algorithms, speed", world_models.planners),
-    "cameras": ("Recording, algorithms, speed", world_models.cameras),
-    "control": ("Recording, algorithms, speed", world_models.control),
-    "speed": ("Recording, algorithms, speed", world_models.speed),
-    "speed_gpu": ("Recording, algorithms, speed", world_models.speed_gpu),
-    "training_memory": ("Recording, algorithms, speed", world_models.training_memory),
+    "planners": ("Recording, algorithms, speed", speed.planners),
+    "cameras": ("Recording, algorithms, speed", speed.cameras),
+    "control": ("Recording, algorithms, speed", speed.control),
+    "speed": ("Recording, algorithms, speed", speed.speed),
+    "speed_gpu": ("Recording, algorithms, speed", speed.speed_gpu),
+    "training_memory": ("Recording, algorithms, speed", speed.training_memory),
 }
 """Study → chapter and section, in the order of the page."""
 

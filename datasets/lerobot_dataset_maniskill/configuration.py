@@ -18,7 +18,8 @@ from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS, POLICY
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
 from lerobot_wmrl.common.hub import check_login
-from lerobot_wmrl.common.policies import read_policy_config, require_trained
+from lerobot_wmrl.common.policies import read_policy_config
+from lerobot_wmrl.common.policy_checks import require_trained
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv

@@ -16,7 +16,8 @@ from lerobot_dataset_maniskill.worker import EpisodeResult, Report, out_of_range
 from lerobot_dataset_maniskill.writer import StartColumns, StepResult, add_step
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.exploration import ExplorationNoise
-from lerobot_wmrl.common.policies import LoadedPolicy, fit_to_environment
+from lerobot_wmrl.common.policies import LoadedPolicy
+from lerobot_wmrl.common.policy_checks import fit_to_environment
 from lerobot_wmrl.data.dataset import save_episode
 from lerobot_wmrl.envs.evaluation_adapter import images_to_numpy
 from lerobot_wmrl.envs.start_frames import maniskill_side

@@ -220,6 +220,30 @@ class InTurn:
         return self.more[step // 2 % len(self.more)](step)
 
 
+def window_actions(
+    batch: Mapping[str, Any], rows: int, length: int, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Return the actions (B, T, A) of windows, and which of these begin with their episode (B, 1).
+
+    Args:
+        batch: as in `clip_from_windows`.
+        rows, length: B and T.
+
+    Raises:
+        ValueError: the action is missing or has another length than the frames.
+    """
+    action, begins = batch.get(ACTION), torch.zeros(rows, 1, dtype=torch.bool, device=device)
+    if action is not None and action.shape in ((rows, length), (rows, length + 1)):
+        action = action[..., None]
+    if action is not None and action.ndim == 3 and action.shape[1] == length + 1:
+        action = action[:, 1:]  # where there is none before the window, it begins with its episode
+        begins = batch.get(f"{ACTION}_is_pad", begins).to(device)[:, :1]
+    if action is None or action.ndim != 3 or action.shape[1] != length:
+        shape = "none" if action is None else f"shape {tuple(action.shape)}"
+        raise ValueError(f"action: {shape}, but the batch has windows of {length} frames; give one a frame")
+    return action, begins
+
+
 def clip_from_windows(
     tokens: Tensor, batch: Mapping[str, Any], camera_key: str, state_size: int, depth: Tensor | None = None,
     features: Tensor | None = None,
@@ -245,15 +269,7 @@ def clip_from_windows(
         ValueError: the action is missing or has another length than the frames; NaN or infinity in a number.
     """
     (rows, length), device = tokens.shape[:2], tokens.device
-    action, begins = batch.get(ACTION), torch.zeros(rows, 1, dtype=torch.bool, device=device)
-    if action is not None and action.shape in ((rows, length), (rows, length + 1)):
-        action = action[..., None]
-    if action is not None and action.ndim == 3 and action.shape[1] == length + 1:
-        action = action[:, 1:]  # where there is none before the window, it begins with its episode
-        begins = batch.get(f"{ACTION}_is_pad", begins).to(device)[:, :1]
-    if action is None or action.ndim != 3 or action.shape[1] != length:
-        shape = "none" if action is None else f"shape {tuple(action.shape)}"
-        raise ValueError(f"action: {shape}, but the batch has windows of {length} frames; give one a frame")
+    action, begins = window_actions(batch, rows, length, device)
     state = action.new_zeros(rows, length, 0)
     if state_size:
         state = batch[OBS_STATE].reshape(rows, length, -1)
@@ -271,16 +287,9 @@ def clip_from_windows(
     tokens, state, action = (take_steps(values, index) for values in (tokens, state, action))
     depth, features = (each if each is None else take_steps(each, index) for each in (depth, features))
     return Clip(
-        tokens=tokens,
-        state=state,
-        action=action,
-        done=done,
-        valid=valid,
-        done_known=known,
-        instructions=list(batch.get("task", [""] * rows)),
-        depth=depth,
-        features=features,
-    )
+        tokens=tokens, state=state, action=action, done=done, valid=valid, done_known=known,
+        instructions=list(batch.get("task", [""] * rows)), depth=depth, features=features,
+    )  # fmt: skip
 
 
 def unpadded_rows(padded: Tensor) -> Tensor:

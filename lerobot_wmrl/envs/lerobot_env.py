@@ -17,7 +17,8 @@ from torch import Tensor
 
 from lerobot_wmrl.common.constants import EVALUATION_SEED, Observation
 from lerobot_wmrl.common.errors import FieldError, within
-from lerobot_wmrl.common.policies import LoadedPolicy, check_fit, learnt_range, seen_shape
+from lerobot_wmrl.common.policies import LoadedPolicy
+from lerobot_wmrl.common.policy_checks import check_fit, learnt_range, seen_shape
 from lerobot_wmrl.envs.configuration_hub import HubEnv
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.tensor_env import Outcome, TensorEnv

@@ -38,6 +38,16 @@ def side_by_side(
     return np.concatenate([rows[0], gap, rows[1]], 1)
 
 
+def save_comparisons(
+    model: ActionWorldModelRewardModel, recording: Recording, shown: Mapping[str, EpisodeReplay], folder: Path
+) -> None:
+    """Save each of the replays by name, as an animation and as a strip."""
+    for name, replay in shown.items():
+        frames = side_by_side(model, recording, replay)
+        save_animation(frames, folder / f"comparison_{name}.gif")
+        save_strip(frames, folder / f"comparison_{name}_strip.png")
+
+
 def save_animation(frames: np.ndarray, path: Path) -> None:
     """Save (T, H, W, 3) uint8 as a GIF at 10 frames a second."""
     images = [enlarged(frame, SCALE) for frame in frames]

@@ -20,13 +20,8 @@ from lerobot.utils.random_utils import seeded_context
 
 from lerobot_wmrl.common.checkpoints import resolved_name
 from lerobot_wmrl.common.errors import FieldError, first_line
-from lerobot_wmrl.common.policies import (
-    LoadedPolicy,
-    check_weights,
-    fit_to_environment,
-    load_processors,
-    read_policy_config,
-)
+from lerobot_wmrl.common.policies import LoadedPolicy, check_weights, load_processors, read_policy_config
+from lerobot_wmrl.common.policy_checks import fit_to_environment
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.envs.lerobot_env import counts_resets, freeze_finished, is_own, runs_in_processes

@@ -155,8 +155,7 @@ def report_action_model(
     threshold: float, frames: int, folder: Path,
 ) -> Report:  # fmt: skip
     """Report accuracy, done, gate and robustness, and save their pictures in `folder`."""
-    outcomes = evaluation.outcomes
-    horizon = recording.steps(HORIZON_SECONDS)
+    outcomes, horizon = evaluation.outcomes, recording.steps(HORIZON_SECONDS)
     taught = outcomes.as_taught(recording.table)
     estimates = headline(evaluation.accuracy, horizon) | done_accuracy(taught, threshold, frames)
     play = [
@@ -190,10 +189,7 @@ def report_action_model(
     if play:
         pictures.save_accuracy(play_steps, folder / "accuracy_play.png")
     pictures.save_sweep(gates, folder / "gate_sweep.png")
-    for name, run in evaluation.shown.items():
-        shown = pictures.side_by_side(model, recording, run)
-        pictures.save_animation(shown, folder / f"comparison_{name}.gif")
-        pictures.save_strip(shown, folder / f"comparison_{name}_strip.png")
+    pictures.save_comparisons(model, recording, evaluation.shown, folder)
     page = [
         headline_table(estimates),
         gate_lines(gate_at(outcomes, threshold, frames), best),

@@ -1,6 +1,6 @@
 """What a dataset offers to a policy that is to be improved, and what it lacks."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from lerobot_wmrl.common.constants import START_COLUMNS, START_TASK
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import camera_key
 from lerobot_wmrl.common.lerobot_commands import edit_advice
-from lerobot_wmrl.common.policies import check_fit
+from lerobot_wmrl.common.policy_checks import check_fit
 from lerobot_wmrl.data.checks import (
     camera_names,
     frame_size,
@@ -104,6 +104,28 @@ def require_mergeable(dataset: LeRobotDataset, env: WmrlManiSkillEnv) -> None:
         )  # fmt: skip
 
 
+def require_improvable(
+    table: EpisodeTable, policy: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]]
+) -> None:
+    """Raise FieldError unless a policy can be improved with these episodes.
+
+    shown: what they show, by LeRobot's names with their shapes, images (3, H, W).
+    """
+    if not any(key.startswith(OBS_IMAGE) for key in policy.image_features):
+        raise FieldError(
+            "policy.path", policy.pretrained_path, "looks at no camera, and a world model imagines frames",
+            "train a policy that looks at one",
+        )  # fmt: skip
+    check_fit(policy, shown, table.action.shape[1], "the dataset")
+    if not table.success.any():
+        has = "has no successful episode" if table.done_known else "says nowhere whether an episode succeeds"
+        raise FieldError(
+            "dataset.root", table.dataset.root, f"{has}, so there is nothing to reward",
+            "add next.success with lerobot-wmrl-label, or record successes",
+        )  # fmt: skip
+    require_shown(table, range(len(table.start)))
+
+
 def look(
     table: EpisodeTable, policy: PreTrainedConfig, episodes: Sequence[int] | None, rollouts: int = 0
 ) -> Findings:
@@ -117,24 +139,11 @@ def look(
     chosen = table.among(episodes)
     held_out, total = int((table.validation & chosen).sum()), len(chosen)
     table = table.subset(chosen)
-    features, root, success = table.dataset.features, table.dataset.root, table.success
+    features, success = table.dataset.features, table.success
     keys = [key for key in policy.image_features if key.startswith(OBS_IMAGE)]
     sizes = {key: frame_size(features[key]) for key in keys if key in features}
     state = {OBS_STATE: tuple(features[OBS_STATE]["shape"])} if OBS_STATE in features else {}
-    if not keys:
-        raise FieldError(
-            "policy.path", policy.pretrained_path, "looks at no camera, and a world model imagines frames",
-            "train a policy that looks at one",
-        )  # fmt: skip
-    shown = {key: (3, *size) for key, size in sizes.items()} | state
-    check_fit(policy, shown, table.action.shape[1], "the dataset")
-    if not success.any():
-        has = "has no successful episode" if table.done_known else "says nowhere whether an episode succeeds"
-        raise FieldError(
-            "dataset.root", root, f"{has}, so there is nothing to reward",
-            "add next.success with lerobot-wmrl-label, or record successes",
-        )  # fmt: skip
-    require_shown(table, range(len(success)))
+    require_improvable(table, policy, {key: (3, *size) for key, size in sizes.items()} | state)
     seconds, fps = table.length / table.dataset.fps, table.dataset.fps
     cameras = [f"{name} {h}x{w}" for name, (h, w) in zip(camera_names(keys), sizes.values(), strict=True)]
     lines = [
@@ -158,7 +167,7 @@ def look(
         held_out=held_out, tasks=len(tasks), fewest=int(tasks.min()), longest=int(table.length.max()),
         usual=usual_length(table),
         success_frames=int(table.length[success].sum()), failures=int((~success).sum()),
-        root=Path(root), total=total,
+        root=Path(table.dataset.root), total=total,
         columns={name: feature["dtype"] for name, feature in features.items()},
         held=int(np.median(np.array(done)[success])),
     )  # fmt: skip

@@ -12,7 +12,8 @@ from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD
 
 from lerobot_wmrl.common.checkpoints import best_model, last_model, resolved_path
 from lerobot_wmrl.common.constants import START_KIND, START_SEED
-from lerobot_wmrl.common.policies import check_units, copy_checkpoint, load_processors
+from lerobot_wmrl.common.policies import copy_checkpoint, load_processors
+from lerobot_wmrl.common.policy_checks import check_units
 from lerobot_wmrl.common.presets import Flags
 from lerobot_wmrl.common.stages import in_fork
 from lerobot_wmrl.data.dataset import ChosenEpisodes

@@ -13,7 +13,8 @@ from PIL import Image, ImageOps
 from torchvision.transforms.v2.functional import pil_to_tensor
 
 from lerobot_wmrl.common.errors import FieldError, within
-from lerobot_wmrl.common.policies import LoadedPolicy, fit_to_environment
+from lerobot_wmrl.common.policies import LoadedPolicy
+from lerobot_wmrl.common.policy_checks import fit_to_environment
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames

@@ -1,9 +1,11 @@
 """What policy, environment and settings must agree on before a training begins."""
 
 import logging
+from typing import Any
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.policies import LoadedPolicy, adopt_features, check_fit
+from lerobot_wmrl.common.policies import LoadedPolicy, unwrapped
+from lerobot_wmrl.common.policy_checks import adopt_features, check_fit
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.lerobot_env import check_frame_rate, check_real_env, shapes_of
@@ -14,6 +16,7 @@ from lerobot_wmrl.rewards.general import RuleBasedReward, potential_discount
 from lerobot_wmrl.rl.configuration_algorithms import AlgorithmConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
+from lerobot_wmrl.rl.protocol import EncodingPolicy
 
 
 def match_policy_to_env(cfg: TrainConfig, policy: LoadedPolicy, env: TensorEnv) -> None:
@@ -100,3 +103,31 @@ def rollout_length(cfg: TrainConfig, longest: int) -> int:
             "never be trained on", "raise it, or lower `env.episode_length`",
         )  # fmt: skip
     return steps
+
+
+def check_std(policy: Any, stochastic: Any, std: float) -> None:
+    """Raise FieldError unless the standard deviation of exploration can be set.
+
+    Args:
+        policy: LeRobot's.
+        stochastic: what samples its actions, the policy itself or an adapter around it.
+        std: `algorithm.initial_std`.
+    """
+    if not hasattr(stochastic, "set_std"):
+        raise FieldError(
+            "algorithm.initial_std", std, "this policy has no standard deviation", "set it to null"
+        )
+    if stochastic is policy and unwrapped(policy) is not policy:
+        raise FieldError(
+            "algorithm.initial_std", std, "is none of the adapters' parameters, which checkpoints hold alone",
+            "set it to null, or train without adapters",
+        )  # fmt: skip
+
+
+def require_encoder(stochastic: Any) -> None:
+    """Raise FieldError unless what samples actions has an encoder that can be kept as it was cloned."""
+    if not isinstance(unwrapped(stochastic), EncodingPolicy):
+        raise FieldError(
+            "algorithm.train_encoder", False, "this policy has no encoder that can be kept",
+            "set it to true, or take the policy cnn",
+        )  # fmt: skip

@@ -14,7 +14,8 @@ from torch.distributions import Normal
 
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.policies import require_chunks, unwrapped
+from lerobot_wmrl.common.policies import unwrapped
+from lerobot_wmrl.common.policy_checks import require_chunks
 from lerobot_wmrl.rl.protocol import StochasticPolicy
 
 INITIAL_STD = 0.1

@@ -4,7 +4,6 @@ T time, B environments or decisions, K action components, J ratios of a decision
 gradients and metrics are averaged over all of them.
 """
 
-import copy
 import logging
 import math
 import time
@@ -32,8 +31,9 @@ from lerobot_wmrl.common.distributed import (
 )
 from lerobot_wmrl.common.errors import FieldError, TrainingStopped, within
 from lerobot_wmrl.common.pipeline import Pipeline, unchanged
-from lerobot_wmrl.common.policies import load_trained_weights, unwrapped
+from lerobot_wmrl.common.policies import frozen_copy, load_trained_weights
 from lerobot_wmrl.common.precision import require_exact_updates
+from lerobot_wmrl.rl.compatibility import check_std, require_encoder
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
 from lerobot_wmrl.rl.minibatches import Batch, Minibatch, Minibatches, read_batch
 from lerobot_wmrl.rl.objective import (
@@ -46,7 +46,6 @@ from lerobot_wmrl.rl.objective import (
 )
 from lerobot_wmrl.rl.observations import as_read_back
 from lerobot_wmrl.rl.policy_adapters import as_stochastic
-from lerobot_wmrl.rl.protocol import EncodingPolicy
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 
 GRAD_CLIP_NORM = 1.0
@@ -96,25 +95,11 @@ class PolicyGradient(RLAlgorithm):
         self.config, self.iteration = config, 0
         self.unrewarded = torch.zeros((), dtype=torch.int64)
         if config.initial_std is not None:
-            if not hasattr(self.policy, "set_std"):
-                raise FieldError(
-                    "algorithm.initial_std", config.initial_std,
-                    "this policy has no standard deviation", "set it to null",
-                )  # fmt: skip
-            if self.policy is policy and unwrapped(policy) is not policy:
-                raise FieldError(
-                    "algorithm.initial_std", config.initial_std,
-                    "is none of the adapters' parameters, which checkpoints hold alone",
-                    "set it to null, or train without adapters",
-                )  # fmt: skip
+            check_std(policy, self.policy, config.initial_std)
             with within("algorithm"):
                 self.policy.set_std(config.initial_std)
         if not config.train_encoder:
-            if not isinstance(unwrapped(self.policy), EncodingPolicy):
-                raise FieldError(
-                    "algorithm.train_encoder", config.train_encoder,
-                    "this policy has no encoder that can be kept", "set it to true, or take the policy cnn",
-                )  # fmt: skip
+            require_encoder(self.policy)
             self.policy.freeze_encoder()
         self.policy.eval()
         self.reference = frozen_copy(self.policy)
@@ -395,13 +380,6 @@ class PolicyGradient(RLAlgorithm):
         self.optimizer.step()
         self.optimization_step += 1
         return norms
-
-
-def frozen_copy(policy: Any) -> Any:
-    """Return a copy that is not trained. It shares the parameters that the policy does not train either, such
-    as a large network under LoRA's adapters."""
-    frozen = {id(each): each for each in policy.parameters() if not each.requires_grad}
-    return copy.deepcopy(policy, frozen).requires_grad_(False)
 
 
 def training_stats(records: list[dict[str, float]], updates: int) -> TrainingStats:

@@ -38,7 +38,8 @@ from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least
 from lerobot_wmrl.common.files import require_new, writing
-from lerobot_wmrl.common.policies import check_weights, read_policy_config, require_trained
+from lerobot_wmrl.common.policies import check_weights, read_policy_config
+from lerobot_wmrl.common.policy_checks import require_trained
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.play.checks import LAST_PORT, whole_number
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig

@@ -53,7 +53,7 @@ def train_policy(cfg: TrainConfig) -> None:
     from lerobot.utils.random_utils import set_seed
 
     from lerobot_wmrl.common.checkpoints import link_latest
-    from lerobot_wmrl.common.policies import require_distillable
+    from lerobot_wmrl.common.policy_checks import require_distillable
     from lerobot_wmrl.envs.lerobot_env import make_tensor_env
     from lerobot_wmrl.rl.budget import check_data
     from lerobot_wmrl.rl.compatibility import settle_discount

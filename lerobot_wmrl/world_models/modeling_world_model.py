@@ -17,7 +17,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.policies import check_units
+from lerobot_wmrl.common.policy_checks import check_units
 from lerobot_wmrl.data.checks import check_cameras, check_depth, check_episode_lengths, check_statistics
 from lerobot_wmrl.data.clips import Clip, clip_from_windows
 from lerobot_wmrl.data.embodiment import check_range, read_embodiment

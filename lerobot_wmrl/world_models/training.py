@@ -102,6 +102,16 @@ def decide_on_instructions(config: RewardModelConfig, table: EpisodeTable, data:
     config.tokenizer = replace(config.tokenizer, instructions=reads and not problem)
 
 
+def require_golden(table: EpisodeTable, episodes: np.ndarray) -> np.ndarray:
+    """Return the episodes (E,) that a text world model learns from. FieldError if there is none."""
+    if episodes.any():
+        return episodes
+    raise FieldError(
+        "dataset.root", table.dataset.root, "has no successful demonstration",
+        "the text world model needs some: record them, or add labels (lerobot-wmrl-label)",
+    )  # fmt: skip
+
+
 def golden_episodes(table: EpisodeTable) -> np.ndarray:
     """Mark the episodes that the text world model learns from. (E,)
 
@@ -150,12 +160,7 @@ def make_sampler(
         frames, cameras = cached_frames(table.dataset, sizes.camera_keys, sizes.image_size), sizes.cameras
         return FrameSampler(table, frames, episodes.nonzero()[0], cameras, batch_size, seed, config.device)
     if isinstance(config, TextWorldModelConfig):
-        episodes = episodes & golden_episodes(table)
-        if not episodes.any():
-            raise FieldError(
-                "dataset.root", table.dataset.root, "has no successful demonstration",
-                "the text world model needs some: record them, or add labels (lerobot-wmrl-label)",
-            )  # fmt: skip
+        episodes = require_golden(table, episodes & golden_episodes(table))
     elif not table.done_known:
         logging.warning(
             "dataset.root=%s: has neither next.success nor next.done: the model cannot learn from it what "

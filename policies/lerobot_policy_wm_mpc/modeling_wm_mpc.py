@@ -10,7 +10,8 @@ from torch import Tensor
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.policies import LoadedPolicy, check_fit, read_policy_config
+from lerobot_wmrl.common.policies import LoadedPolicy, read_policy_config
+from lerobot_wmrl.common.policy_checks import check_fit
 from lerobot_wmrl.data.frames import Context, Frames
 from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras

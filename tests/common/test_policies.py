@@ -13,14 +13,13 @@ from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.checkpoints import link_checkpoint
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import (
-    check_fit,
-    check_units,
     check_weights,
     copy_checkpoint,
     load_policy,
     load_trained_weights,
     read_policy_config,
 )
+from lerobot_wmrl.common.policy_checks import check_fit, check_units
 from tests.hub_server import Hub, Repo
 from tests.rl.checkpoints import save_untrained_policy
 

@@ -15,7 +15,8 @@ from lerobot.processor import PolicyProcessorPipeline, UnnormalizerProcessorStep
 from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.policies import learnt_range, read_policy_config
+from lerobot_wmrl.common.policies import read_policy_config
+from lerobot_wmrl.common.policy_checks import learnt_range
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.lerobot_env import (
     LeRobotTensorEnv,

@@ -12,13 +12,8 @@ from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.common.policies import (
-    check_fit,
-    copy_checkpoint,
-    load_policy,
-    load_processors,
-    read_policy_config,
-)
+from lerobot_wmrl.common.policies import copy_checkpoint, load_policy, load_processors, read_policy_config
+from lerobot_wmrl.common.policy_checks import check_fit
 from lerobot_wmrl.improve.own_cameras import with_own_cameras, without_renaming
 from tests.rl.act_checkpoint import IMAGE, small_act
 from tests.rl.small_smolvla import save_small_smolvlm, small_smolvla

@@ -21,6 +21,7 @@ from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
 from lerobot_policy_openvla.processor_openvla import make_openvla_pre_post_processors
 from lerobot_wmrl.common.policies import (
     check_weights,
+    frozen_copy,
     load_policy,
     load_processors,
     read_policy_config,
@@ -33,7 +34,6 @@ from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import look
 from lerobot_wmrl.improve.plan import Plan
 from lerobot_wmrl.improve.progress import Progress
-from lerobot_wmrl.rl.policy_gradient import frozen_copy
 from lerobot_wmrl.scripts.convert_openvla import ConvertOpenVLAConfig, convert
 from lerobot_wmrl.scripts.train import main
 from tests.commands import run_here

@@ -31,7 +31,7 @@ from lerobot_wmrl.common.checkpoints import model_folder
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.pipeline import action_unit, unchanged
-from lerobot_wmrl.common.policies import require_distillable
+from lerobot_wmrl.common.policy_checks import require_distillable
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
