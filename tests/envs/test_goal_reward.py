@@ -8,7 +8,7 @@ import torch
 from lpips import LPIPS
 from torch import Tensor
 
-from lerobot_wmrl.envs import start_frames
+from lerobot_wmrl.envs import starts
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -68,7 +68,7 @@ def test_starts_are_the_same_however_many_are_tokenised_at_once(config, monkeypa
     """So that memory does not grow with their number."""
     config = replace(config, dataset=StartFrames(root=config.dataset.root))
     whole = config.create_tensor_env(1)
-    monkeypatch.setattr(start_frames, "STARTS_AT_ONCE", 4)
+    monkeypatch.setattr(starts, "STARTS_AT_ONCE", 4)
     cut = config.create_tensor_env(1)
     assert len(cut.starts) == 6
     assert torch.equal(cut.starts.frames.tokens, whole.starts.frames.tokens)

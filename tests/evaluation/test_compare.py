@@ -30,7 +30,6 @@ from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.lerobot_env import runs_in_processes
-from lerobot_wmrl.evaluation import compare as running
 from lerobot_wmrl.evaluation import policy_rollouts
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 from lerobot_wmrl.evaluation.policy_rollouts import opened
@@ -246,14 +245,14 @@ def test_what_another_command_has_run_meanwhile_is_kept(config, monkeypatch):
         return make(*args)
 
     monkeypatch.setattr(policy_rollouts, "opened", opened)
-    monkeypatch.setattr(running, "run_block", None)
+    monkeypatch.setattr(policy_rollouts, "run_block", None)
     compare(config)
     assert results_of(config) == whole
 
 
 def kill_in_third_block(config: CompareConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     """Interrupt a comparison after two blocks."""
-    run_block, blocks = running.run_block, []
+    run_block, blocks = policy_rollouts.run_block, []
 
     def killed(*args: Any) -> list[Episode]:
         blocks.append(args)
@@ -261,10 +260,10 @@ def kill_in_third_block(config: CompareConfig, monkeypatch: pytest.MonkeyPatch) 
             raise KeyboardInterrupt
         return run_block(*args)
 
-    monkeypatch.setattr(running, "run_block", killed)
+    monkeypatch.setattr(policy_rollouts, "run_block", killed)
     with pytest.raises(KeyboardInterrupt):
         compare(config)
-    monkeypatch.setattr(running, "run_block", run_block)
+    monkeypatch.setattr(policy_rollouts, "run_block", run_block)
 
 
 def test_a_finished_comparison_makes_no_environment_again(config, monkeypatch):
