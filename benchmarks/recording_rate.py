@@ -20,7 +20,7 @@ from lerobot_dataset_maniskill import maniskill
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import planned_parts
 from lerobot_dataset_maniskill.worker import PartRecorder, silence_libraries
-from lerobot_wmrl.common.constants import KINDS, PLAY, TASKS
+from lerobot_wmrl.common.constants import KINDS, PLAY, TASK_NAMES
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
@@ -36,7 +36,7 @@ def recording(**fields: Any) -> Iterator[tuple[RecordConfig, Path]]:
     """A configuration for all tasks, and a folder for its parts."""
     with tempfile.TemporaryDirectory() as folder:
         env = WmrlManiSkillEnv(cameras=list(CAMERAS))
-        config = RecordConfig(Path(folder) / "dataset", env=env, tasks=list(TASKS), seed=SEED, **fields)
+        config = RecordConfig(Path(folder) / "dataset", env=env, tasks=list(TASK_NAMES), seed=SEED, **fields)
         yield config, Path(folder)
 
 

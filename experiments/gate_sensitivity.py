@@ -19,7 +19,7 @@ import numpy as np
 from lerobot.utils.import_utils import register_third_party_plugins
 from tqdm import tqdm
 
-from lerobot_wmrl.common.constants import START_COLUMNS, START_SCENE, START_TASK, TASKS
+from lerobot_wmrl.common.constants import START_COLUMNS, START_SCENE, START_TASK, TASK_NAMES
 from lerobot_wmrl.common.files import markdown_table, write_json
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import open_dataset
@@ -53,7 +53,7 @@ def repeated(simulation: Simulation, table: EpisodeTable, errors_mm: Sequence[fl
         (rows,) = table.rows([episode])
         actions = table.action[rows]
         direction = np.random.default_rng(seed).normal(size=2)
-        simulation.task = task_of(TASKS[task])
+        simulation.task = task_of(TASK_NAMES[task])
         for column, error in enumerate(errors_mm):
             simulation.reset(SCENES[scene], seed)
             put_aside(simulation, error / 1000 * direction)
@@ -98,7 +98,7 @@ def main() -> None:
     given = make_parser().parse_args()
     table = read_episodes(open_dataset(given.root))
     scenes = [SCENES[scene] for scene in np.unique(table.columns[START_SCENE])]
-    task = task_of(TASKS[int(table.columns[START_TASK][0])])
+    task = task_of(TASK_NAMES[int(table.columns[START_TASK][0])])
     simulation = Simulation(task, scenes, Rendering(cameras=()))
     rows = measure(repeated(simulation, table, given.errors), table.success, given.errors)
     write_json(given.output, {"episodes": len(table.start), "errors": rows})

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lerobot_wmrl.common.constants import START_TASK, TASKS
+from lerobot_wmrl.common.constants import START_TASK, TASK_NAMES
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import open_dataset
@@ -59,7 +59,7 @@ def told(model: Any, table: EpisodeTable, threshold: float, frames: int) -> dict
         of_task = tasks == task
         recognised = of_task & own.success & (own.first_predicted_success(threshold, frames) >= 0)
         confused = recognised & (other.first_predicted_success(threshold, frames) >= 0)
-        found[TASKS[task]] = {
+        found[TASK_NAMES[task]] = {
             **gate_at(own.where(of_task), threshold, frames).as_json(),
             "under_another_instruction": Proportion(int(confused.sum()), int(recognised.sum())).as_json(),
         }

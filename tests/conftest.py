@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wmrl.common.constants import KINDS, TASKS
+from lerobot_wmrl.common.constants import KINDS, TASK_NAMES
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, FPS, STATE_NAMES
 from tests.hub_client import hub as hub
 
@@ -143,7 +143,7 @@ def synthetic_dataset(
         dataset.save_episode()
     dataset.finalize()
     vocabulary = {
-        "tasks": TASKS, "kinds": KINDS, "scenes": ["synthetic 0", "synthetic 1"],
+        "tasks": TASK_NAMES, "kinds": KINDS, "scenes": ["synthetic 0", "synthetic 1"],
         "action_low": ACTION_LOW, "action_high": ACTION_HIGH, "hold_frames": HOLD_FRAMES,
         "image_size": size, "cameras": cameras,
     }  # fmt: skip

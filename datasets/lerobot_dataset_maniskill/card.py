@@ -13,7 +13,7 @@ import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
-from lerobot_wmrl.common.constants import KINDS, START_KIND, START_SCENE, START_TASK, TASKS
+from lerobot_wmrl.common.constants import KINDS, START_KIND, START_SCENE, START_TASK, TASK_NAMES
 from lerobot_wmrl.common.files import markdown_table, write_text
 from lerobot_wmrl.common.frame_strips import enlarged, in_a_row
 from lerobot_wmrl.common.statistics import Proportion, evenly_spaced
@@ -76,7 +76,7 @@ def write_card(root: Path, repo_id: str, table: EpisodeTable) -> None:
         low=vocabulary["action_low"],
         high=vocabulary["action_high"],
         hold=vocabulary["hold_frames"],
-        tasks=", ".join(TASKS),
+        tasks=", ".join(TASK_NAMES),
         kinds=", ".join(KINDS),
     )
     write_text(root / CARD_FILE, text)
@@ -103,7 +103,7 @@ def success_rows(table: EpisodeTable) -> Iterator[tuple[Any, ...]]:
         rate = Proportion(int(chosen.sum()), len(chosen))
         low, high = rate.interval
         shown = f"{rate.share:.0%} ({low:.0%}–{high:.0%})"
-        yield TASKS[task], KINDS[kind], rate.n, rate.k, shown
+        yield TASK_NAMES[task], KINDS[kind], rate.n, rate.k, shown
 
 
 def picture_lines(table: EpisodeTable) -> Iterator[str]:
@@ -155,7 +155,7 @@ def chosen_examples(table: EpisodeTable) -> list[Example]:
     best = np.lexsort((kinds, ~success))
     chosen = [best[tasks[best] == task][0] for task in np.unique(tasks)]
     return [
-        Example(TASKS[tasks[episode]], int(episode), KINDS[kinds[episode]], bool(success[episode]))
+        Example(TASK_NAMES[tasks[episode]], int(episode), KINDS[kinds[episode]], bool(success[episode]))
         for episode in chosen
     ]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_wmrl.common.constants import KINDS, POLICY, START_COLUMNS, TASKS
+from lerobot_wmrl.common.constants import KINDS, POLICY, START_COLUMNS, TASK_NAMES
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene, scene_for_seed
 
@@ -101,7 +101,7 @@ def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
         start = (config.seed + number) % len(starts)
         visit = config.seed * MOST_VISITS + number // len(starts)
         task, scene, seed, _ = (int(table.columns[name][starts[start]]) for name in START_COLUMNS)
-        plans.append(EpisodePlan(TASKS[task], POLICY, SCENES[scene], seed, start, visit))
+        plans.append(EpisodePlan(TASK_NAMES[task], POLICY, SCENES[scene], seed, start, visit))
     if len(plans) > len(starts) and not config.exploration:
         logging.warning(
             "%d episodes begin from %d starts: without --exploration a policy whose actions are not random "

@@ -15,7 +15,7 @@ from lerobot.configs.video import DepthEncoderConfig, RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.manifest import EpisodePlan
-from lerobot_wmrl.common.constants import KINDS, START_COLUMNS, TASKS
+from lerobot_wmrl.common.constants import KINDS, START_COLUMNS, TASK_NAMES
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.data.embodiment import HIGH, LOW
 from lerobot_wmrl.data.episodes import parquet_files
@@ -140,7 +140,7 @@ def write_vocabulary(root: Path, recording: Mapping[str, Any]) -> None:
     write_json(
         root / VOCABULARY_FILE,
         {
-            "tasks": list(TASKS),
+            "tasks": list(TASK_NAMES),
             "kinds": list(KINDS),
             "scenes": [scene.as_json() for scene in SCENES],
             "action_low": list(ACTION_LOW),

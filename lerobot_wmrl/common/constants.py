@@ -8,7 +8,7 @@ Observation = dict[str, Any]
 INSTRUCTIONS: Final = "task"
 """LeRobot's name of the instructions in an observation."""
 
-TASKS: Final = ("push", "pull", "pick_place", "move_to_aim")
+TASK_NAMES: Final = ("push", "pull", "pick_place", "move_to_aim")
 """Vocabulary of the column `start.task`."""
 
 POLICY: Final = "policy"

@@ -10,7 +10,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
-from lerobot_wmrl.common.constants import TASKS
+from lerobot_wmrl.common.constants import TASK_NAMES
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.images import camera_key
 from lerobot_wmrl.data.dataset import ChosenEpisodes
@@ -156,9 +156,9 @@ class WorldModelEnv(EnvConfig):
             raise FieldError("done_threshold", self.done_threshold, "must be a probability")
         if self.dataset.max_starts < 1:
             raise FieldError("dataset.max_starts", self.dataset.max_starts, "must be at least 1")
-        unknown = sorted({*(self.dataset.tasks or ())} - {*TASKS})
+        unknown = sorted({*(self.dataset.tasks or ())} - {*TASK_NAMES})
         if unknown:
-            raise FieldError("dataset.tasks", unknown, f"choose from {', '.join(TASKS)}")
+            raise FieldError("dataset.tasks", unknown, f"choose from {', '.join(TASK_NAMES)}")
 
     def _check_rewarding(self, model: Any) -> None:
         """Raise FieldError if the world model would never reward."""

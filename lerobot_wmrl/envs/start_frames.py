@@ -14,7 +14,7 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import INSTRUCTIONS, START_SCENE, START_TASK, TASKS
+from lerobot_wmrl.common.constants import INSTRUCTIONS, START_SCENE, START_TASK, TASK_NAMES
 from lerobot_wmrl.common.errors import FieldError, renamed, within
 from lerobot_wmrl.common.images import stretch, to_pixels
 from lerobot_wmrl.common.statistics import evenly_spaced
@@ -42,9 +42,9 @@ class StartImages(NamedTuple):
     """The frames in which K imagined episodes begin.
 
     images (K, N, H, W, 3) uint8; first_images, of the same shape: the first frame of the recorded episode
-    that each is taken from; state (K, P); K instructions; tasks (K,), indices into `TASKS`, −1 where unknown;
-    depth, a function of a world model that returns (K, S) in metres, or None if the model does not look at
-    depth.
+    that each is taken from; state (K, P); K instructions; tasks (K,), indices into `TASK_NAMES`, −1 where
+    unknown; depth, a function of a world model that returns (K, S) in metres, or None if the model does not
+    look at depth.
     """
 
     images: np.ndarray
@@ -55,7 +55,7 @@ class StartImages(NamedTuple):
     depth: Callable[[WorldModelRewardModel], Tensor | None]
 
     def of_task(self, task: int) -> "StartImages":
-        """Return the starts of one task, an index into `TASKS`."""
+        """Return the starts of one task, an index into `TASK_NAMES`."""
         return self.chosen(np.flatnonzero(self.tasks == task))
 
     def chosen(self, rows: np.ndarray) -> "StartImages":
@@ -98,7 +98,7 @@ def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
     """
     wanted, scene = table.among(source.episodes), table.column(START_SCENE)
     for name, column, values in (
-        ("tasks", table.column(START_TASK), [TASKS.index(task) for task in source.tasks or ()]),
+        ("tasks", table.column(START_TASK), [TASK_NAMES.index(task) for task in source.tasks or ()]),
         ("scenes", scene, source.scenes or ()),
     ):
         if values and not np.isin(column, values).any():
@@ -273,7 +273,7 @@ def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> Star
     Raises:
         FieldError: the dataset's frames, which they have to be like, are no squares of one size.
     """
-    tasks, sizes = source.tasks or TASKS[:1], config.trained_tokenizer
+    tasks, sizes = source.tasks or TASK_NAMES[:1], config.trained_tokenizer
     remedy = "start in the dataset's episodes (`dataset.root`)"
     side = maniskill_side(sizes, "dataset.resets", source.resets, remedy)
     env = WmrlManiSkillEnv(

@@ -9,7 +9,7 @@ import torch
 from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import KINDS, PLAY, START_KIND, START_TASK, TASKS
+from lerobot_wmrl.common.constants import KINDS, PLAY, START_KIND, START_TASK, TASK_NAMES
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.statistics import roc_auc
 from lerobot_wmrl.data.episodes import EpisodeTable
@@ -238,7 +238,7 @@ def by_task(outcomes: Outcomes, table: EpisodeTable) -> dict[str, Outcomes]:
     none if there is but one instruction, or more than `MOST_TASKS`."""
     tasks = table.column(START_TASK)[outcomes.episodes]
     if (tasks >= 0).any():
-        return {TASKS[task]: outcomes.where(tasks == task) for task in np.unique(tasks[tasks >= 0])}
+        return {TASK_NAMES[task]: outcomes.where(tasks == task) for task in np.unique(tasks[tasks >= 0])}
     instructions = np.array([table.instructions[each] for each in outcomes.episodes])
     distinct = np.unique(instructions).tolist()
     if not 1 < len(distinct) <= MOST_TASKS:

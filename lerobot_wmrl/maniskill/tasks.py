@@ -10,7 +10,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from lerobot_wmrl.common.constants import TASKS as TASK_NAMES
+from lerobot_wmrl.common.constants import TASK_NAMES
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.maniskill.objects import ContainerSpec, ObjectSpec
 from lerobot_wmrl.maniskill.scenes import Scene

@@ -47,7 +47,7 @@ class Schedule:
     Args:
         iterations: rollouts, each followed by an update.
         save_freq: iterations between checkpoints.
-        seed: first seed of the first iteration's episodes.
+        seed: the training's, from which `first_seed` makes those of its episodes.
         log_freq: iterations between lines in the terminal.
     """
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wmrl.common.constants import TASKS
+from lerobot_wmrl.common.constants import TASK_NAMES
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.start_frames import branch_frames
@@ -24,21 +24,21 @@ def test_starts_can_be_chosen_by_task_and_scene(config):
         return len(env.starts)
 
     assert count() == 6
-    assert count(scenes=[1], tasks=[TASKS[0]]) == 3
+    assert count(scenes=[1], tasks=[TASK_NAMES[0]]) == 3
     assert count(split="train,ind", scenes=[0]) == 3
     assert count(episodes=[4, 0, 5]) == 3
     with pytest.raises(ValueError, match=r"^dataset\.episodes=\[9\]: there is no episode 9"):
         count(episodes=[9])
     with pytest.raises(ValueError, match=r"^dataset\.scenes=\[7\]: no episode"):
         count(scenes=[7])
-    with pytest.raises(ValueError, match=rf"^dataset\.tasks=\['{TASKS[1]}'\]: no episode"):
-        count(tasks=[TASKS[1]])
+    with pytest.raises(ValueError, match=rf"^dataset\.tasks=\['{TASK_NAMES[1]}'\]: no episode"):
+        count(tasks=[TASK_NAMES[1]])
     with pytest.raises(ValueError, match=r"^dataset\.tasks=\['fly'\]: choose from"):
         count(tasks=["fly"])
 
 
 @pytest.mark.parametrize(("given", "message"), [
-    ({"frames": Path("starts.npz"), "tasks": [TASKS[0]]}, "saved frames do not say their task"),
+    ({"frames": Path("starts.npz"), "tasks": [TASK_NAMES[0]]}, "saved frames do not say their task"),
     ({"frames": Path("starts.npz"), "split": "ood"}, "saved frames do not say their task, scene or split"),
     ({"resets": 2, "split": "validation,ood"}, r"split=validation,ood: .*ManiSkill.* ind or ood"),
     ({"resets": -1}, r"^dataset\.resets=-1: must be at least 1"),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lerobot_wmrl.common.constants import TASKS
+from lerobot_wmrl.common.constants import TASK_NAMES
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.start_frames import read_start_images
@@ -22,7 +22,7 @@ def test_they_are_what_the_simulator_shows(recwarn):
     source = StartFrames(resets=4, tasks=["push", "pull"], scenes=[0, 2], split="ind")
     found = read_start_images(source, config)
     assert found.images.shape == (4, 2, 32, 32, 3)
-    assert found.tasks.tolist() == [TASKS.index(task) for task in ("push", "push", "pull", "pull")]
+    assert found.tasks.tolist() == [TASK_NAMES.index(task) for task in ("push", "push", "pull", "pull")]
     env = WmrlManiSkillEnv(task="pull", scenes=[0, 2], cameras=["third_view"], image_size=32)
     simulation = env.create_simulation()
     simulation.task = task_of("pull")

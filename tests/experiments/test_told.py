@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.told import other_instructions, outcomes_with, told
-from lerobot_wmrl.common.constants import TASKS
+from lerobot_wmrl.common.constants import TASK_NAMES
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.evaluation.outcomes import seen_outcomes
 from lerobot_wmrl.evaluation.replay import Recording
@@ -35,7 +35,7 @@ def test_frames_are_judged_as_the_gate_judges_them_and_under_another_instruction
     other = outcomes_with(model, table, other_instructions(np.arange(6) % 2, table.instructions))
     assert not np.allclose(own.probability, other.probability, atol=1e-3, equal_nan=True)
     everything = told(model, table, threshold=0.0, frames=1)
-    assert [*everything] == [TASKS[0], TASKS[1]]
+    assert [*everything] == [TASK_NAMES[0], TASK_NAMES[1]]
     for task, found in enumerate(everything.values()):
         successes = int(table.success[task::2].sum())
         assert found["recall"]["k"] == found["recall"]["n"] == successes

@@ -12,7 +12,7 @@ from lerobot_dataset_maniskill.maniskill import ManiSkillEpisodes
 from lerobot_dataset_maniskill.recorder import merge, missing_parts
 from lerobot_dataset_maniskill.worker import PartRecorder, ScriptedController
 from lerobot_dataset_maniskill.writer import StartColumns, StepResult, add_step
-from lerobot_wmrl.common.constants import TASKS
+from lerobot_wmrl.common.constants import TASK_NAMES
 from lerobot_wmrl.maniskill.episode import Frame
 
 ROWS = 10
@@ -34,7 +34,7 @@ class MadeUpRecorder(PartRecorder):
     def _record_episode(self, dataset: LeRobotDataset, plan: EpisodePlan) -> bool:
         rng = np.random.default_rng(plan.seed)
         succeeds = plan.kind != "near_miss"
-        start = StartColumns(f"{plan.task} it", TASKS.index(plan.task), plan)
+        start = StartColumns(f"{plan.task} it", TASK_NAMES.index(plan.task), plan)
         for row in range(ROWS):
             frame = self._frame(row, rng, success=False)
             following = self._frame(row + 1, rng, success=succeeds and row >= SUCCESS_ROW)
