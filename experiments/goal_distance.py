@@ -18,16 +18,10 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from experiments.reward_curves import NEVER, recorded
+from experiments.reward_curves import recorded, with_recorded_actions
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.data.dataset import open_dataset
-from lerobot_wmrl.data.episodes import read_episodes
-from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.envs.start_frames import chosen_episodes
-from lerobot_wmrl.envs.world_model_env import make_world_model_env
 from lerobot_wmrl.evaluation.gate import gate_at
 from lerobot_wmrl.evaluation.outcomes import Outcomes
-from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 MEASURES: Final = {"classifier": "done_probability", "goal": "similarity"}
@@ -42,21 +36,11 @@ MOST_FALSE: Final = 0.05
 
 def imagined(given: argparse.Namespace, root: str) -> dict[str, Outcomes]:
     """Imagine the episodes of a dataset with their own actions. → what each measure says of every frame"""
-    table, source = read_episodes(open_dataset(root)), StartFrames(root=root, max_starts=given.max_episodes)
-    episodes = chosen_episodes(table, source)
-    env = make_world_model_env(
-        WorldModelEnv(
-            world_model_path=given.model_path, text_world_model_path=given.text_model_path, dataset=source,
-            reward=GeneralConfig(device="cpu"), done_frames=NEVER, episode_length=NEVER,
-        ),
-        len(episodes), "cpu",
-    )  # fmt: skip
-    steps = int(table.length[episodes].max())
-    actions = Recording.read(table, env.model).actions(episodes, steps, torch.device("cpu"))
+    table, episodes, env, actions = with_recorded_actions(given, root, GeneralConfig(device="cpu"))
     env.reset(seed=list(range(env.num_envs)))
     with torch.no_grad():
         parts = [env.step(action)[-1]["reward_parts"] for action in actions.unbind(1)]
-    done = recorded(table, episodes, table.done, steps)
+    done = recorded(table, episodes, table.done, actions.shape[1])
     ended, found = np.isnan(done), {}
     for measure, name in MEASURES.items():
         values = torch.stack([part[name] for part in parts], 1).cpu().numpy()

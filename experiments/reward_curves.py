@@ -184,22 +184,31 @@ def other_hands(shape: tuple[int, int]) -> dict[str, Tensor]:
     }
 
 
-def curves_of(given: argparse.Namespace, root: str, rewards: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all numbers of one dataset of recorded episodes."""
-    table, config = read_episodes(open_dataset(root)), GeneralConfig(device="cpu")
-    source = StartFrames(root=root, max_starts=given.max_episodes)
+def with_recorded_actions(
+    given: argparse.Namespace, root: str, reward: GeneralConfig
+) -> tuple[EpisodeTable, np.ndarray, WorldModelVectorEnv, Tensor]:
+    """Return a dataset, its chosen episodes (E,), an environment in which each is imagined and none ends, and
+    their own actions (E, T, A)."""
+    table, source = read_episodes(open_dataset(root)), StartFrames(root=root, max_starts=given.max_episodes)
     episodes = chosen_episodes(table, source)
     env = make_world_model_env(
         WorldModelEnv(
             world_model_path=given.model_path, text_world_model_path=given.text_model_path, dataset=source,
-            reward=config, done_frames=NEVER, episode_length=NEVER,
+            reward=reward, done_frames=NEVER, episode_length=NEVER,
         ),
         len(episodes), "cpu",
     )  # fmt: skip
-    probe = RewardProbe(rewards)
-    env.reward = probe
     steps = int(table.length[episodes].max())
     actions = Recording.read(table, env.model).actions(episodes, steps, torch.device("cpu"))
+    return table, episodes, env, actions
+
+
+def curves_of(given: argparse.Namespace, root: str, rewards: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all numbers of one dataset of recorded episodes."""
+    config = GeneralConfig(device="cpu")
+    table, episodes, env, actions = with_recorded_actions(given, root, config)
+    probe = RewardProbe(rewards)
+    env.reward, steps = probe, actions.shape[1]
     column = np.asarray(table.dataset.hf_dataset.with_format("numpy")["next.reward"][:]).reshape(-1)
     curves = {
         "rule_based": recorded(table, episodes, column, steps), **judged(env, probe, actions, config),

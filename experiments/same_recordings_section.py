@@ -40,10 +40,10 @@ def section(load: Load) -> str:
 
 def time_limit(load: Load) -> str:
     """Return the section: success within 40 and within 80 steps, and changes within 80."""
-    return "\n\n".join(longer(load, cells) for cells in groups(load, TIME_LIMIT, ()).values())
+    return "\n\n".join(by_limit(load, cells) for cells in groups(load, TIME_LIMIT, ()).values())
 
 
-def longer(load: Load, cells: Sequence[Cell]) -> str:
+def by_limit(load: Load, cells: Sequence[Cell]) -> str:
     """Return two tables of the cells of a number of demonstrations: success by limit, and what is gained."""
     seeds = {cell["seed"] for cell in cells}
     before = [

@@ -62,7 +62,8 @@ def model_folder(path: str | Path) -> Path:
 
 
 def settled_folder(path: str) -> Path:
-    """Return `model_folder` with the checkpoint behind the link `last` in place of it: the link moves on."""
+    """Return `model_folder` with the checkpoint behind the link `last` in place of it: the link moves on.
+    It is as relative or absolute as the path."""
     folder = model_folder(path)
     if not folder.is_dir():
         return folder
@@ -77,11 +78,11 @@ def resolved_path(path: str) -> str:
     A training's output folder and its link `last` become the checkpoint behind them: a longer training moves
     the link on. A path that is no folder is returned as it is: it may be a hub id.
     """
-    folder = model_folder(path)
+    folder = settled_folder(path)
     if not folder.is_dir():
         return path
-    folder = folder.resolve()
-    return str(folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder)
+    below = folder.is_absolute() and folder.is_relative_to(Path.cwd())
+    return str(folder.relative_to(Path.cwd()) if below else folder)
 
 
 def resolved_name(path: str) -> str:

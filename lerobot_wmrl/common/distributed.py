@@ -29,13 +29,13 @@ def process_seed(seed: int) -> int:
     return seed + PROCESS_STRIDE * rank
 
 
-def part_random_numbers(seed: int) -> None:
+def reseed_other_ranks(seed: int) -> None:
     """Give every process but the first, which goes on as it would alone, random numbers of its own."""
     if not is_first_process():
         set_seed(process_seed(seed))
 
 
-def share_buffers(module: nn.Module) -> None:
+def broadcast_buffers(module: nn.Module) -> None:
     """Replace a module's buffers, which no gradient keeps alike, by those of the first process."""
     if rank_and_size()[1] > 1:
         for buffer in module.buffers():

@@ -30,9 +30,7 @@ from lerobot_wmrl.world_models.checkpoint import check_dataset
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
-from lerobot_wmrl.world_models.modeling_world_model import (
-    WorldModelRewardModel,
-)
+from lerobot_wmrl.world_models.modeling_world_model import WorldModelRewardModel
 
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 """Its multiples, modulo 1, are spread over the unit interval, any of them in a row."""

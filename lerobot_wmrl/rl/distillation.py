@@ -16,11 +16,11 @@ from tqdm import tqdm
 from lerobot_wmrl.common.constants import INSTRUCTIONS, Observation
 from lerobot_wmrl.common.distributed import (
     average_gradients,
+    broadcast_buffers,
     gather_counts,
     hidden_progress,
     mean_over_processes,
     rank_and_size,
-    share_buffers,
 )
 from lerobot_wmrl.common.errors import FieldError, TrainingStopped
 from lerobot_wmrl.common.pipeline import Pipeline
@@ -253,7 +253,7 @@ class Distillation(RLAlgorithm):
             losses.append(loss.item())
             norms.append(norm.item())
         self.lerobot_policy.eval()
-        share_buffers(self.lerobot_policy)
+        broadcast_buffers(self.lerobot_policy)
         self.iteration += 1
         count = max(len(losses), 1)
         means = {"loss": sum(losses) / count, "norm": sum(norms) / count}

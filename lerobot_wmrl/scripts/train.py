@@ -30,8 +30,8 @@ from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.distributed import (
     LONGEST_WAIT,
     is_first_process,
-    part_random_numbers,
     rank_and_size,
+    reseed_other_ranks,
     wait_for_all,
 )
 from lerobot_wmrl.common.errors import FieldError, within
@@ -137,7 +137,7 @@ def train_in(env: TensorEnv, cfg: TrainConfig, claim: Claim, policy: LoadedPolic
     if cfg.peft is not None:
         policy.policy = with_new_adapters(policy.policy, cfg.peft)
     algorithm = make_algorithm(policy.policy, cfg.algorithm, cfg.output_dir)
-    part_random_numbers(cfg.seed)  # of which the distilled policy's loss draws some
+    reseed_other_ranks(cfg.seed)  # of which the distilled policy's loss draws some
     pipeline = make_pipeline(config, *policy.processors, shown=compacted(env))
     if isinstance(algorithm, Distillation):
         algorithm.check_recorded(env, pipeline)

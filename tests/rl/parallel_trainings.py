@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "rl"))
 from chunk_policy import ACTIONS, ChunkPolicy, Sample
 from point_env import PointEnv
 
-from lerobot_wmrl.common.distributed import part_random_numbers, rank_and_size, share_buffers
+from lerobot_wmrl.common.distributed import broadcast_buffers, rank_and_size, reseed_other_ranks
 from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.rl.callbacks import Record
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig, PPOConfig
@@ -106,8 +106,8 @@ if __name__ == "__main__":
         run(each, Path(sys.argv[1]) / each)
     rank, module = rank_and_size()[0], torch.nn.BatchNorm1d(2)
     torch.manual_seed(0)
-    part_random_numbers(0)
+    reseed_other_ranks(0)
     module(torch.rand(8, 2))
-    share_buffers(module)
+    broadcast_buffers(module)
     torch.save((torch.rand(3), module.running_mean), Path(sys.argv[1]) / f"apart-{rank}.pt")
     PartialState().destroy_process_group()
