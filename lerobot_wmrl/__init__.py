@@ -35,3 +35,5 @@ CONFIGURATIONS = (
 
 for _module in CONFIGURATIONS:
     import_module(_module)
+
+import_module("lerobot_wmrl.common.dataset_schemas").set_columns_one_by_one()
