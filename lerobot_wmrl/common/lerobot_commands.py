@@ -12,7 +12,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, step_folders
-from lerobot_wmrl.common.presets import Flags, format_flags
+from lerobot_wmrl.common.presets import Flags, format_lerobot_flags
 
 DERIVED = ("features", "features_map")
 """Settings of an environment that are derived from others."""
@@ -23,8 +23,8 @@ def train_command(folder: Path, flags: Sequence[str]) -> list[str]:
     checkpoint there. It refuses a folder without one."""
     if whole := whole_checkpoint(folder):
         trained = whole / PRETRAINED_MODEL_DIR / "train_config.json"
-        return ["lerobot-train", *format_flags({"config_path": str(trained), "resume": True})]
-    return ["lerobot-train", *flags, *format_flags({"output_dir": str(folder)})]
+        return ["lerobot-train", *format_lerobot_flags({"config_path": str(trained), "resume": True})]
+    return ["lerobot-train", *flags, *format_lerobot_flags({"output_dir": str(folder)})]
 
 
 def whole_checkpoint(folder: Path) -> Path | None:
@@ -46,7 +46,7 @@ def merge_command(folder: Path, datasets: Mapping[str, Path]) -> list[str]:
 def edit_command(folder: Path, operation: str, flags: Flags) -> list[str]:
     """Return lerobot-edit-dataset into a new folder. It refuses what an interrupted call left there."""
     new = {"new_repo_id": f"local/{folder.name}", "new_root": str(folder), "operation.type": operation}
-    return ["lerobot-edit-dataset", *format_flags(new | dict(flags))]
+    return ["lerobot-edit-dataset", *format_lerobot_flags(new | dict(flags))]
 
 
 def edit_advice(root: str | Path, operation: str, flags: Flags) -> str:

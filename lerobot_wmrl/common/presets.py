@@ -6,6 +6,7 @@ Every file is a configuration that LeRobot's `--config_path=FILE` reads too.
 """
 
 import json
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
@@ -23,6 +24,9 @@ FOLDER: Final = Path(str(files("lerobot_wmrl") / "presets"))
 
 TYPE: Final = ".type"
 """Ends the flags that choose one of several classes, which share a prefix but not their settings."""
+
+TAKEN_AS_TYPED: Final = re.compile(r"(^|\.)(path|config_path)$")
+"""Flags that LeRobot takes from the command line before draccus reads it."""
 
 
 def expand_preset(argv: Sequence[str], command: str) -> list[str]:
@@ -134,6 +138,17 @@ def format_flags(settings: Mapping[str, Any]) -> list[str]:
     return [f"--{name}={format_value(value)}" for name, value in settings.items()]
 
 
+def format_lerobot_flags(settings: Mapping[str, Any]) -> list[str]:
+    """Write settings for a command of LeRobot's own, which reads texts as YAML, as ours do not: a dataset in
+    `2024_01_15` has quotation marks. It takes checkpoints (`policy.path`) as they are."""
+    return [
+        f"--{name}={_format_text(str(value), listed=False)}"
+        if isinstance(value, str | Path) and not TAKEN_AS_TYPED.search(name)
+        else f"--{name}={format_value(value)}"
+        for name, value in settings.items()
+    ]
+
+
 def flag_as_typed(name: str, value: Any) -> str:
     """Return a flag as one types it in a shell, whatever its value has in it: `'--dataset.root=my data'`."""
     return shlex.join(format_flags({name: value}))
@@ -147,12 +162,14 @@ def format_value(value: Any) -> str:
 
 
 def _format_element(value: Any) -> str:
-    """Write an element of a list; a text that YAML would not read as the same one has quotation marks."""
-    text = format_value(value)
-    if not isinstance(value, str | Path):
-        return text
+    return _format_text(str(value), listed=True) if isinstance(value, str | Path) else format_value(value)
+
+
+def _format_text(text: str, listed: bool) -> str:
+    """Write a text, in quotation marks if YAML would not read it as the same one."""
+    written, meant = (f"[{text}]", [text]) if listed else (text, text)
     try:
-        plain = yaml.safe_load(f"[{text}]") == [text]
+        plain = yaml.safe_load(written) == meant
     except yaml.YAMLError:
         plain = False
     return text if plain else json.dumps(text, ensure_ascii=False)

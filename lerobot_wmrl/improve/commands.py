@@ -12,7 +12,7 @@ import numpy as np
 from lerobot_wmrl.common.constants import EVALUATION_SEED, SELECTION_SEED
 from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.lerobot_commands import edit_command, env_flags, merge_command, train_command
-from lerobot_wmrl.common.presets import Flags, format_flags
+from lerobot_wmrl.common.presets import Flags, format_flags, format_lerobot_flags
 from lerobot_wmrl.common.stages import Stage, never
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -102,8 +102,8 @@ def cloned(progress: Progress) -> list[str]:
     # LeRobot keeps loaded adapters, but writes no policy's configuration beside them without the flag
     adapters: Flags = {"peft.method_type": "LORA"} if policy.use_peft else {}
     return train_command(plan.out / "cloned", [
-        *format_flags(plan.sizes.cloning_settings()),
-        *format_flags({
+        *format_lerobot_flags(plan.sizes.cloning_settings()),
+        *format_lerobot_flags({
             "policy.path": plan.policy, "policy.push_to_hub": False, **adapters,
             "dataset.repo_id": f"local/{table.dataset.root.name}",
             "dataset.root": str(table.dataset.root), "dataset.episodes": successes,

@@ -11,7 +11,7 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot_wmrl.common.checkpoints import best_model, last_model
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import within
-from lerobot_wmrl.common.presets import format_flags
+from lerobot_wmrl.common.presets import format_lerobot_flags
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
 
@@ -85,7 +85,7 @@ def evaluation(cfg: TrainConfig, path: str, shared: bool = False) -> str:
         if name.endswith(PATHS) and (place.is_absolute() or place.exists()):
             settings[name] = LOCAL_FOLDER
     flags = {"policy.path": path, **settings, "eval.n_episodes": 100, "seed": EVALUATION_SEED}
-    return shlex.join(["lerobot-eval", *format_flags(flags)])
+    return shlex.join(["lerobot-eval", *format_lerobot_flags(flags)])
 
 
 def publish(cfg: TrainConfig, lines: list[str]) -> None:

@@ -66,9 +66,9 @@ def start_and_kill(root: Path, reached: str) -> Path:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished dataset whose recording was killed three times, and whose second part was torn."""
+    """A finished dataset whose recording was killed twice, and whose second part was torn."""
     root = tmp_path_factory.mktemp("recorded")
-    for reached in ("recording.json", ".part-*.partial", "part-00000"):
+    for reached in (".part-*.partial", "part-00000"):
         work = start_and_kill(root, reached)
     first = (work / "part-00000" / "meta" / "info.json").stat().st_mtime_ns
     torn = work / ".part-00001.1.partial"
