@@ -8,7 +8,7 @@ import json
 import sys
 from pathlib import Path
 
-from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy
+from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE, chosen_policy
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -23,7 +23,7 @@ def main() -> None:
     """Entry point."""
     folder: Path = make_parser().parse_args().comparison
     try:
-        print(chosen_policy(json.loads((folder / RESULTS).read_text())))
+        print(chosen_policy(json.loads((folder / COMPARISON_FILE).read_text())))
     except (OSError, ValueError) as error:
         sys.exit(f"error: {folder}: {error}")
 

@@ -14,7 +14,7 @@ from experiments.value import seconds
 from experiments.value_cells import Cell, against, published
 from lerobot_wmrl.common.files import markdown_table as table
 from lerobot_wmrl.common.statistics import RunsMean
-from lerobot_wmrl.evaluation.comparison import RESULTS
+from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE
 
 CELL: Final = ("task", "episodes", "noise", "rollouts", "iterations", "seed")
 
@@ -31,7 +31,7 @@ TIMED: Final = ("data", "cloned", "improve", "longer", "comparison")
 
 def metaworld(study: Study) -> Results:
     """Return the success of the three policies on the same starts, and the minutes of each step."""
-    comparison: dict[str, Any] = json.loads((study.folder / "comparison" / RESULTS).read_text())
+    comparison: dict[str, Any] = json.loads((study.folder / "comparison" / COMPARISON_FILE).read_text())
     outcomes = zip(*(episode["successes"] for episode in comparison["episodes"]), strict=True)
     gate = study.folder / "improve" / "check" / "metrics.json"
     results = {

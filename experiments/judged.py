@@ -59,8 +59,8 @@ def judged(folder: Path, domain: str, inside: Callable[[str], str | None]) -> di
 
     inside: why a policy counts as trained in the world model, if it does.
     """
-    said = json.loads((folder / f"judged_{domain}" / judgement.RESULTS).read_text())
-    real = json.loads((folder / f"real_{domain}" / comparison.RESULTS).read_text())
+    said = json.loads((folder / f"judged_{domain}" / judgement.JUDGEMENT_FILE).read_text())
+    real = json.loads((folder / f"real_{domain}" / comparison.COMPARISON_FILE).read_text())
     confusion = Confusion(
         Proportion.from_json(said["recall"]), Proportion.from_json(said["false_positive_rate"])
     )

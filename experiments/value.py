@@ -12,7 +12,7 @@ from experiments.success import Results, outcomes, rate
 from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
-from lerobot_wmrl.evaluation.comparison import RESULTS
+from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE
 
 CELL: Final = ("task", "kind", "demonstrations", "rollouts", "seed", "starts")
 """Variables of the study that say which cell it is."""
@@ -77,7 +77,7 @@ def successes(root: Path) -> int:
 
 def begun(run: Path) -> dict[str, Any]:
     """Return which policy imagination has chosen to begin from, and how often each succeeded in it."""
-    results = run / "comparison" / RESULTS
+    results = run / "comparison" / COMPARISON_FILE
     if not results.exists():
         return {"start": None}
     comparison = json.loads(results.read_text())

@@ -17,7 +17,7 @@ from lerobot_dataset_maniskill.writer import find_damage
 from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.files import foreign_files, write_json, writing
-from lerobot_wmrl.common.output_folders import locked
+from lerobot_wmrl.common.output_folders import hold_lock
 from lerobot_wmrl.common.policies import check_weights
 from lerobot_wmrl.data.budget import IMAGINED, ROLLOUTS, Ledger
 from lerobot_wmrl.data.dataset import open_dataset
@@ -25,7 +25,7 @@ from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 
-CONTENT_FILE: Final = "recording.json"
+RECORDING_FILE: Final = "recording.json"
 LOCK: Final = "lock"
 
 
@@ -115,7 +115,7 @@ def check_budget(config: RecordConfig, ledger: Ledger) -> None:
 
 def discard(work: Path, content: Mapping[str, Any]) -> None:
     """Remove the work folder that a command left that was killed just after finishing."""
-    stored = work / CONTENT_FILE
+    stored = work / RECORDING_FILE
     if stored.is_file() and json.loads(stored.read_text()) == content:
         shutil.rmtree(work, ignore_errors=True)
 
@@ -127,12 +127,12 @@ def claimed(root: Path, work: Path, content: Mapping[str, Any]) -> Iterator[None
     A command that fails before a part is recorded leaves no folder behind.
     """
     work.mkdir(parents=True, exist_ok=True)
-    with locked(root, work / LOCK):
-        stored = work / CONTENT_FILE
+    with hold_lock(root, work / LOCK):
+        stored = work / RECORDING_FILE
         if stored.is_file() and has_parts(work):
             require_same_recording(json.loads(stored.read_text()), content, root)
         else:
-            if not stored.is_file() and foreign_files(work, LOCK, CONTENT_FILE):
+            if not stored.is_file() and foreign_files(work, LOCK, RECORDING_FILE):
                 raise FieldError(
                     "output_dir", root, f"{work} beside it, for what is unfinished, holds something else",
                     "move that away, or choose another folder",

@@ -52,6 +52,13 @@ class Checkpoint:
     path: str = ""
 
 
+def may_be_on_hub(name: str | Path) -> bool:
+    """Return whether a name can be one of the hub's, `model` or `owner/model`. All others are paths, and so
+    is what begins with `outputs`, where commands write by default."""
+    parts = Path(name).parts
+    return len(parts) <= 2 and not str(name).startswith((".", "/")) and parts[:1] != ("outputs",)
+
+
 def model_folder(path: str | Path) -> Path:
     """Return the `pretrained_model` folder inside a training's output folder or one of its checkpoints."""
     root = Path(path)
@@ -179,7 +186,7 @@ def checkpoint_digest(path: str | Path, parts: bool = True) -> str:
     folder, digest = local_model_folder(path, MODEL_FILES), hashlib.sha256()
     for file in sorted(each for pattern in MODEL_FILES for each in folder.glob(pattern)):
         digest.update(f"{file.name} {file_digest(file)}".encode())
-    for part in parts_of(folder) if parts else ():
+    for part in named_checkpoints(folder) if parts else ():
         digest.update(checkpoint_digest(part).encode())
     return digest.hexdigest()[:12]
 
@@ -190,7 +197,7 @@ def file_digest(path: Path) -> str:
         return hashlib.file_digest(content, "sha256").hexdigest()[:12]
 
 
-def parts_of(folder: Path) -> list[Path]:
+def named_checkpoints(folder: Path) -> list[Path]:
     """Return the checkpoints on this machine that a checkpoint's settings name."""
     settings = [json.loads(path.read_text()) for name in SETTINGS if (path := folder / name).is_file()]
     named = [model_folder(each[key]) for each in settings for key in PARTS if each.get(key)]

@@ -25,7 +25,7 @@ from lerobot.utils.utils import init_logging
 
 from lerobot_wmrl.common.errors import STOPPED, FieldError, Stopped
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.output_folders import CONFIG_FILE
+from lerobot_wmrl.common.output_folders import RUN_CONFIG_FILE
 from lerobot_wmrl.common.presets import TYPE, format_flags, format_value, read_settings
 from lerobot_wmrl.common.settings import (
     Setting,
@@ -86,7 +86,7 @@ class RunConfig:
 
     def save_pretrained(self, folder: Path) -> None:
         """Write the configuration as LeRobot does, `train_config.json`."""
-        write_json(folder / CONFIG_FILE, draccus.encode(self))
+        write_json(folder / RUN_CONFIG_FILE, draccus.encode(self))
 
 
 def given_path(path_field: str) -> GivenPath:

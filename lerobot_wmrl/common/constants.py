@@ -22,6 +22,12 @@ START_COLUMNS: Final = ("start.task", "start.scene", "start.seed", "start.kind")
 
 START_TASK, START_SCENE, START_SEED, START_KIND = START_COLUMNS
 
+DONE_THRESHOLD: Final = 0.5
+"""Predicted success probability from which a frame counts as done (θ, eq. 7), where nothing else is given."""
+
+DONE_FRAMES: Final = 3
+"""Consecutive done frames that make an imagined success, where nothing else is given."""
+
 DYNA: Final = "dyna"
 """Folder of a training's output in which the world models of its Dyna rounds are."""
 

@@ -68,6 +68,13 @@ def require_share(settings: object, *fields: str) -> None:
             raise FieldError(field, getattr(settings, field), "must be between 0 and 1")
 
 
+def require_probability(settings: object, *fields: str) -> None:
+    """Raise FieldError for the first of the `fields` of `settings` that is not between 0 and 1, or is one."""
+    for field in fields:
+        if not 0 < getattr(settings, field) < 1:
+            raise FieldError(field, getattr(settings, field), "must be above 0 and below 1")
+
+
 def require_choice(settings: object, field: str, choices: Iterable[object]) -> None:
     """Raise FieldError unless the field is one of the choices."""
     value, known = getattr(settings, field), list(choices)

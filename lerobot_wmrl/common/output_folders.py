@@ -13,7 +13,7 @@ from lerobot.utils.utils import flatten_dict
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import foreign_files, write_json
 
-CONFIG_FILE: Final = "train_config.json"
+RUN_CONFIG_FILE: Final = "train_config.json"
 """The settings of a run, in its folder."""
 
 CONTENT_FILE: Final = "content.json"
@@ -40,7 +40,7 @@ class Claim:
     settings: Mapping[str, Any]
     free: Collection[str] = ()
     content: Mapping[str, str] = field(default_factory=dict)
-    marker: str = CONFIG_FILE
+    marker: str = RUN_CONFIG_FILE
 
     def check(self) -> None:
         """Raise FieldError unless the folder is new, empty or this run's; leave it as it is."""
@@ -49,7 +49,7 @@ class Claim:
         if not self._stored.is_file():
             require_empty(self.output_dir, self.marker, LOCK, CONTENT_FILE)
             return
-        free = {"output_dir", *self.free} if self.marker == CONFIG_FILE else self.free
+        free = {"output_dir", *self.free} if self.marker == RUN_CONFIG_FILE else self.free
         require_same(self.output_dir, json.loads(self._stored.read_text()), self.settings, free)
         if self._stored_content.is_file():
             stored = json.loads(self._stored_content.read_text())
@@ -64,7 +64,7 @@ class Claim:
         """
         self.check()
         self.output_dir.mkdir(parents=True, exist_ok=True)
-        with locked(self.output_dir, self.output_dir / LOCK):
+        with hold_lock(self.output_dir, self.output_dir / LOCK):
             self.check()  # another command may have begun there meanwhile
             if not self._stored.is_file():
                 if self.content:
@@ -109,7 +109,7 @@ def require_same(
 
 
 @contextmanager
-def locked(output_dir: Path, lock: Path, seconds: float = 0) -> Iterator[None]:
+def hold_lock(output_dir: Path, lock: Path, seconds: float = 0) -> Iterator[None]:
     """Hold a lock file, which is made where it is missing, against others who write the folder.
 
     Args:

@@ -16,6 +16,7 @@ from lerobot_wmrl.common.checkpoints import (
     ADAPTERS_FILE,
     given_revision,
     local_model_folder,
+    may_be_on_hub,
     settled_folder,
 )
 from lerobot_wmrl.common.constants import Observation
@@ -38,7 +39,7 @@ def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
             "policy.pretrained_revision", revision, f"{path} is a folder, and these have no revisions",
             "leave it out, or give the name of a policy on the hub",
         )  # fmt: skip
-    if not (folder / "config.json").is_file() and (folder.exists() or path.startswith((".", "/"))):
+    if not (folder / "config.json").is_file() and (folder.exists() or not may_be_on_hub(path)):
         raise FieldError(
             "policy.path", path, "no checkpoint there (config.json is missing)",
             "give the output folder of a policy's training, or a hub id",
@@ -204,11 +205,6 @@ def adapter_config(config: PreTrainedConfig) -> Any:
     from peft import PeftConfig
 
     return PeftConfig.from_pretrained(str(config.pretrained_path))
-
-
-def may_be_on_hub(name: str) -> bool:
-    """Return whether a name can be one of the hub's, `model` or `owner/model`. All others are paths."""
-    return len(Path(name).parts) <= 2 and not name.startswith((".", "/"))
 
 
 def unwrapped(policy: Any) -> Any:

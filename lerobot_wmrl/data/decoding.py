@@ -23,7 +23,7 @@ def rows_of(dataset: LeRobotDataset, episode: int) -> slice:
     return slice(rows["dataset_from_index"], rows["dataset_to_index"])
 
 
-def parts_of(dataset: LeRobotDataset, episode: int) -> list[slice]:
+def row_parts(dataset: LeRobotDataset, episode: int) -> list[slice]:
     """Return an episode's rows in parts whose frames are decoded at once."""
     rows = rows_of(dataset, episode)
     return [slice(first, min(first + DECODED, rows.stop)) for first in range(rows.start, rows.stop, DECODED)]

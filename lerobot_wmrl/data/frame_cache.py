@@ -25,9 +25,9 @@ from lerobot_wmrl.common.checkpoints import weights_digest
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import stretch
 from lerobot_wmrl.data.checks import depth_key
-from lerobot_wmrl.data.decoding import decode, decode_depth, parts_of
+from lerobot_wmrl.data.decoding import decode, decode_depth, row_parts
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
-from lerobot_wmrl.data.resumable_array import Units, batches, memory_map
+from lerobot_wmrl.data.resumable_array import WritePlan, batches, memory_map
 
 
 class FrameEncoder(Protocol):
@@ -74,13 +74,13 @@ def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str], side: int
     key = digest([dataset.num_episodes, dataset.num_frames, side, *camera_keys, *file_stamps(dataset)])
 
     def write(target: np.ndarray, episode: int) -> None:
-        for rows in parts_of(dataset, episode):
+        for rows in row_parts(dataset, episode):
             for camera, name in enumerate(camera_keys):
                 frames = stretch(decode(dataset, episode, name, rows), side, side)
                 target[rows, camera] = frames.permute(0, 2, 3, 1).numpy()
 
-    units = Units(dataset.num_episodes, write, "Decoding frames")
-    return memory_map(cache_dir(dataset) / f"frames-{key}.npy", shape, np.uint8, units)
+    plan = WritePlan(dataset.num_episodes, write, "Decoding frames")
+    return memory_map(cache_dir(dataset) / f"frames-{key}.npy", shape, np.uint8, plan)
 
 
 def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder) -> np.ndarray:
@@ -208,16 +208,16 @@ def token_depth(metres: Tensor, grid: int) -> Tensor:
 def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int) -> np.ndarray:
     """Return all frames' depth as a read-only memory map, float32 (rows, S) metres; decoded once."""
     keys = [depth_key(camera) for camera in camera_keys]
-    units = [dataset.features[name].get("info") for name in keys]
-    key = digest([dataset.num_episodes, dataset.num_frames, grid, *keys, *units, *file_stamps(dataset)])
+    encodings = [dataset.features[name].get("info") for name in keys]
+    key = digest([dataset.num_episodes, dataset.num_frames, grid, *keys, *encodings, *file_stamps(dataset)])
 
     def write(target: np.ndarray, episode: int) -> None:
-        for rows in parts_of(dataset, episode):
+        for rows in row_parts(dataset, episode):
             cameras = [token_depth(decode_depth(dataset, episode, name, rows), grid) for name in keys]
             target[rows] = torch.cat(cameras, 1).numpy()
 
     shape = (dataset.num_frames, len(keys) * grid**2)
-    episodes = Units(dataset.num_episodes, write, "Decoding depth")
+    episodes = WritePlan(dataset.num_episodes, write, "Decoding depth")
     return memory_map(cache_dir(dataset) / f"depth-{key}.npy", shape, np.float32, episodes)
 
 

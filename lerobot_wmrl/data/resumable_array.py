@@ -26,26 +26,26 @@ PROGRESS_SECONDS: Final = 10
 """Seconds of work on a cache that are lost at most when a process is killed."""
 
 
-class Units(NamedTuple):
-    """What a cache is written in, one after another: `total` of them, `write(target, number)`, and the
-    progress bar's description."""
+class WritePlan(NamedTuple):
+    """How a cache is written: in `total` units, one after another by `write(target, number)`, and what the
+    progress bar calls that."""
 
     total: int
     write: Callable[[np.ndarray, int], None]
     description: str
 
 
-def batches(rows: int, compute: Callable[[slice], np.ndarray], description: str) -> Units:
-    """Return units of `BATCH` rows, each of which is what `compute` returns for it."""
+def batches(rows: int, compute: Callable[[slice], np.ndarray], description: str) -> WritePlan:
+    """Plan units of `BATCH` rows, each of which is what `compute` returns for it."""
 
     def write(target: np.ndarray, number: int) -> None:
         part = slice(number * BATCH, (number + 1) * BATCH)
         target[part] = compute(part)
 
-    return Units(-(-rows // BATCH), write, description)
+    return WritePlan(-(-rows // BATCH), write, description)
 
 
-def memory_map(path: Path, shape: tuple[int, ...], dtype: type, units: Units) -> np.ndarray:
+def memory_map(path: Path, shape: tuple[int, ...], dtype: type, plan: WritePlan) -> np.ndarray:
     """Return the array at `path`, written if it is missing. The file appears only once it is whole.
 
     A call that was interrupted or killed is continued, wherever it ran: the name of its file says how many
@@ -58,10 +58,8 @@ def memory_map(path: Path, shape: tuple[int, ...], dtype: type, units: Units) ->
         target = np.lib.format.open_memmap(partial, mode="r+")
         recorded, done = time.monotonic(), begun
         try:
-            for number in trange(
-                begun, units.total, desc=units.description, initial=begun, total=units.total
-            ):
-                units.write(target, number)
+            for number in trange(begun, plan.total, desc=plan.description, initial=begun, total=plan.total):
+                plan.write(target, number)
                 done = number + 1
                 if time.monotonic() - recorded > PROGRESS_SECONDS:
                     partial, recorded = record_progress(partial, path, target, done), time.monotonic()
@@ -85,7 +83,7 @@ def continued(path: Path) -> tuple[Path, int, int] | None:
     Such files of other caches are removed: they belong to content that has changed.
     """
     for torn in path.parent.glob("[!.]*.partial"):
-        if (lock := locked(torn)) is None:
+        if (lock := try_lock(torn)) is None:
             continue
         count = torn.name.removeprefix(f"{path.stem}.").partition(".")[0]
         if count.isdecimal() and int(count):
@@ -103,7 +101,7 @@ def begin(path: Path, shape: tuple[int, ...], dtype: type) -> tuple[Path, int, i
         with partial.open("r+b") as file:  # a full disk says so now, and not by a bus error later
             if hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(file.fileno(), 0, partial.stat().st_size)
-        lock = locked(partial, own=True)
+        lock = try_lock(partial, own=True)
     except OSError:
         partial.unlink(missing_ok=True)
         raise
@@ -111,7 +109,7 @@ def begin(path: Path, shape: tuple[int, ...], dtype: type) -> tuple[Path, int, i
     return begin(path, shape, dtype) if lock is None else (partial, 0, lock)
 
 
-def locked(file: Path, own: bool = False) -> int | None:
+def try_lock(file: Path, own: bool = False) -> int | None:
     """Return a descriptor that holds a file's lock until it is closed, or its process ends.
 
     Returns:

@@ -10,8 +10,8 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
-from lerobot_wmrl.common.constants import TASK_NAMES
-from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.constants import DONE_FRAMES, DONE_THRESHOLD, TASK_NAMES
+from lerobot_wmrl.common.errors import FieldError, require_at_least, require_probability
 from lerobot_wmrl.common.images import camera_key
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -113,8 +113,8 @@ class WorldModelEnv(EnvConfig):
     dataset: StartFrames = field(default_factory=StartFrames)
     reward: RewardModelConfig = field(default_factory=GeneralConfig)
     episode_length: int | None = None
-    done_threshold: float = 0.5
-    done_frames: int = 3
+    done_threshold: float = DONE_THRESHOLD
+    done_frames: int = DONE_FRAMES
     device: str | None = None
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=lambda: {ACTION: ACTION, "agent_pos": OBS_STATE})
@@ -151,9 +151,8 @@ class WorldModelEnv(EnvConfig):
 
     def _check(self) -> None:
         require_at_least(self, 1, "done_frames")
+        require_probability(self, "done_threshold")
         self._check_length()
-        if not 0 < self.done_threshold < 1:
-            raise FieldError("done_threshold", self.done_threshold, "must be a probability")
         if self.dataset.max_starts < 1:
             raise FieldError("dataset.max_starts", self.dataset.max_starts, "must be at least 1")
         unknown = sorted({*(self.dataset.tasks or ())} - {*TASK_NAMES})

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
 from lerobot_wmrl.evaluation.sequential import SequentialTest
 
-RESULTS: Final = "comparison.json"
+COMPARISON_FILE: Final = "comparison.json"
 """The file of a comparison, in its folder."""
 
 

@@ -13,7 +13,7 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 from lerobot_wmrl.common.checkpoints import model_folder
 from lerobot_wmrl.common.constants import DYNA, START_SCENE
 from lerobot_wmrl.common.errors import FieldError, first_line
-from lerobot_wmrl.common.output_folders import CONFIG_FILE
+from lerobot_wmrl.common.output_folders import RUN_CONFIG_FILE
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, choose_episodes, read_episodes
@@ -216,7 +216,7 @@ def _trainings(checkpoint: str, trained: str) -> Iterator[tuple[str, Mapping[str
     visited = set()
     while checkpoint and checkpoint not in visited:
         visited.add(checkpoint)
-        settings = stored_settings(model_folder(checkpoint) / CONFIG_FILE)
+        settings = stored_settings(model_folder(checkpoint) / RUN_CONFIG_FILE)
         yield checkpoint, settings
         checkpoint = str((settings.get(trained) or {}).get("pretrained_path") or "")
 

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from lerobot_wmrl.common.constants import DONE_FRAMES, DONE_THRESHOLD
 from lerobot_wmrl.common.statistics import Estimate, Proportion
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
@@ -75,7 +76,10 @@ class Gate:
 
 
 def success_gate(
-    model: ActionWorldModelRewardModel, dataset_root: str | Path, threshold: float = 0.5, frames: int = 3
+    model: ActionWorldModelRewardModel,
+    dataset_root: str | Path,
+    threshold: float = DONE_THRESHOLD,
+    frames: int = DONE_FRAMES,
 ) -> Gate:
     """Replay every episode of a dataset of rollouts open loop and count false positives and recall.
 

@@ -12,7 +12,7 @@ from lerobot_wmrl.evaluation.calibration import (
     corrected_rate,
 )
 
-RESULTS: Final = "judgement.json"
+JUDGEMENT_FILE: Final = "judgement.json"
 """The file of a judgement, in its folder."""
 
 LEAST_YOUDEN: Final = 0.5

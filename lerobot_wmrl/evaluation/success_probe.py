@@ -137,12 +137,16 @@ def labelled_frames(
         return None
     index = np.concatenate([rng.choice(of_class, count, replace=False) for of_class in classes])
     starts = table.start[episodes[index]]
-    first, images = (decoded(tokenizer, recording.frames, which, starts) for which in (starts, rows[index]))
+    first, images = (
+        shrunk_reconstructions(tokenizer, recording.frames, which, starts) for which in (starts, rows[index])
+    )
     return LabelledFrames(first, images, torch.from_numpy(success[index]).to(images.device))
 
 
 @torch.no_grad()
-def decoded(tokenizer: FrameTokenizer, frames: np.ndarray, rows: np.ndarray, starts: np.ndarray) -> Tensor:
+def shrunk_reconstructions(
+    tokenizer: FrameTokenizer, frames: np.ndarray, rows: np.ndarray, starts: np.ndarray
+) -> Tensor:
     """Encode and decode recorded frames, at the probe's size: rows (R,) → (R, N, 3, h, w).
 
     starts (R,): the first rows of their episodes.

@@ -41,10 +41,10 @@ would fill the data."""
 ROLLOUT_COLUMNS: Final = (*DEFAULT_FEATURES, ACTION, REWARD, SUCCESS, DONE, START_SEED, START_KIND)
 """Columns of recorded rollouts, beside those that the policy sees and the environment declares."""
 
-DONE_FRAMES: Final = 2
+STRICT_DONE_FRAMES: Final = 2
 """Consecutive done frames that make an imagined success, if the data shows that many."""
 
-DONE_THRESHOLD: Final = 0.95
+STRICT_DONE_THRESHOLD: Final = 0.95
 """RL finds every failure that the world model takes for a success: the threshold is strict."""
 
 
@@ -210,4 +210,7 @@ class Plan:
 
     def strict_criterion(self) -> Flags:
         """Return when the check sees success, and imagination too unless that recognises nothing."""
-        return {"done_threshold": DONE_THRESHOLD, "done_frames": min(DONE_FRAMES, max(1, self.findings.held))}
+        return {
+            "done_threshold": STRICT_DONE_THRESHOLD,
+            "done_frames": min(STRICT_DONE_FRAMES, max(1, self.findings.held)),
+        }

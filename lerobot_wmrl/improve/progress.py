@@ -8,7 +8,7 @@ from typing import Any, Final
 from lerobot_wmrl.common.checkpoints import last_model
 from lerobot_wmrl.common.presets import Flags
 from lerobot_wmrl.common.stages import FAILED, read_record
-from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy, most_successful
+from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE, chosen_policy, most_successful
 from lerobot_wmrl.improve.learnt import LearntEpisodes
 from lerobot_wmrl.improve.plan import Plan
 from lerobot_wmrl.improve.results import CHECK, read_check, read_json
@@ -76,7 +76,7 @@ class Progress:
 
     def _decided(self, stage: str, decide: Callable[[Mapping[str, Any]], str], titles: Sequence[str]) -> str:
         """Return which of the policies with these titles a comparison decides for."""
-        results = read_json(self.plan.out / stage / RESULTS)
+        results = read_json(self.plan.out / stage / COMPARISON_FILE)
         return titles[[*results["policies"]].index(decide(results))]
 
     def fitted(self) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.evaluation.comparison import RESULTS, Comparison, episodes_from_json
+from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE, Comparison, episodes_from_json
 from lerobot_wmrl.rl.callbacks import RECORD_FILE, Record
 from lerobot_wmrl.rl.gate import SuccessGate
 from lerobot_wmrl.rl.selection import Selection
@@ -36,7 +36,7 @@ class Place:
 
 def read_place(name: str, folder: Path, titles: Sequence[str]) -> Place:
     """Read a finished comparison of policies, which have these titles, in this order."""
-    saved = read_json(folder / RESULTS)
+    saved = read_json(folder / COMPARISON_FILE)
     episodes = episodes_from_json(saved)
     starts = len({episode.seed for episode in episodes})
     return Place(name, Comparison(titles, starts, "all", saved["alpha"], stop_early=False, episodes=episodes))

@@ -12,7 +12,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.output_folders import locked
+from lerobot_wmrl.common.output_folders import hold_lock
 from lerobot_wmrl.data.dataset import open_dataset, save_episode
 from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
 from lerobot_wmrl.data.features import episode_features, observation_row
@@ -141,7 +141,7 @@ def recover(folder: Path) -> None:
 
 def exclusive(folder: Path) -> AbstractContextManager[None]:
     """Hold a dataset while it is replaced. FieldError if somebody else does not come to an end."""
-    return locked(folder, folder.with_name(f".{folder.name}.lock"), WAITING_SECONDS)
+    return hold_lock(folder, folder.with_name(f".{folder.name}.lock"), WAITING_SECONDS)
 
 
 def beside(folder: Path) -> tuple[Path, Path]:

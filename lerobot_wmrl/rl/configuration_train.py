@@ -114,7 +114,7 @@ def load_config(cfg: TrainConfig) -> PreTrainedConfig:
     where the policy is published never comes from the checkpoint, as it would overwrite the SFT policy.
     """
     from lerobot_wmrl.common.checkpoints import UNPUBLISHED
-    from lerobot_wmrl.common.output_folders import CONFIG_FILE
+    from lerobot_wmrl.common.output_folders import RUN_CONFIG_FILE
     from lerobot_wmrl.common.policies import read_policy_config
 
     (typed, overrides), stored = cfg.given["policy"], cfg.policy
@@ -125,7 +125,7 @@ def load_config(cfg: TrainConfig) -> PreTrainedConfig:
     if stored is not None:
         given = {each.removeprefix("--").partition("=")[0] for each in overrides}
         settings = [each.name for each in fields(stored) if each.name not in READ]
-        stored_run = Path(parser.parse_arg("config_path") or "").name == CONFIG_FILE
+        stored_run = Path(parser.parse_arg("config_path") or "").name == RUN_CONFIG_FILE
         for name in settings if stored_run and not typed else PUBLISHING:
             if name not in given:
                 setattr(cfg.policy, name, getattr(stored, name))

@@ -25,7 +25,7 @@ from lerobot_wmrl.data.decoding import decode, rows_of
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.start_frames import every_chosen_episode
-from lerobot_wmrl.rl.observations import ObservationBuffer, decoded
+from lerobot_wmrl.rl.observations import ObservationBuffer, as_policy_input
 
 ROWS = "rows"
 """Name of `LabelBatch.rows` in a file of labels."""
@@ -78,7 +78,7 @@ class LabelBatch:
             name: value[last if name == INSTRUCTIONS else rows] for name, value in self.observations.items()
         }
         actions = {name: value[labels] for name, value in self.actions.items()}
-        return decoded(observations | actions, self.instructions)
+        return as_policy_input(observations | actions, self.instructions)
 
 
 class Labels:

@@ -52,10 +52,10 @@ class ObservationBuffer:
         return {name: value.flatten(0, 1)[rows_on[value.device]] for name, value in self.tensors.items()}
 
     def _decoded(self, stored: dict[str, Tensor]) -> Observation:
-        return decoded(stored, list(self.instructions))
+        return as_policy_input(stored, list(self.instructions))
 
 
-def decoded(stored: dict[str, Tensor], instructions: Sequence[str]) -> Observation:
+def as_policy_input(stored: dict[str, Tensor], instructions: Sequence[str]) -> Observation:
     """Return stored observations as the policy sees them: images in [0, 1], instructions as texts."""
     return {
         name: value.float() / 255 if name.startswith(OBS_IMAGE)

@@ -23,7 +23,7 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.constants import EVALUATION_SEED
-from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
+from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice, require_probability
 from lerobot_wmrl.common.files import write_json, writing
 from lerobot_wmrl.common.output_folders import Claim
 
@@ -84,13 +84,12 @@ class CompareConfig(RunConfig):
                 "batch_size", self.batch_size, f"there are {self.n_episodes} episodes",
                 "lower it, or raise `n_episodes`",
             )  # fmt: skip
-        if not 0 < self.alpha < 1:
-            raise FieldError("alpha", self.alpha, "must be a probability between 0 and 1")
+        require_probability(self, "alpha")
 
 
 def compare(cfg: CompareConfig) -> None:
     """Run the policies, or what is missing of their episodes; write comparison.json and comparison.png."""
-    from lerobot_wmrl.evaluation.comparison import RESULTS, Comparison
+    from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE, Comparison
     from lerobot_wmrl.evaluation.pictures import save_comparison
     from lerobot_wmrl.evaluation.policy_rollouts import read_policies
 
@@ -106,7 +105,7 @@ def compare(cfg: CompareConfig) -> None:
     if not comparison.finished:
         run(cfg, claim, comparison, configs)
     save_comparison(comparison, cfg.output_dir / "comparison.png")
-    print(f"{comparison}\n{RESULTS} and comparison.png are in {cfg.output_dir}")
+    print(f"{comparison}\n{COMPARISON_FILE} and comparison.png are in {cfg.output_dir}")
 
 
 def named_content(cfg: CompareConfig) -> dict[str, str]:
@@ -119,9 +118,9 @@ def named_content(cfg: CompareConfig) -> dict[str, str]:
 
 def stored_episodes(cfg: CompareConfig) -> "list[Episode]":
     """Return the episodes that have run before."""
-    from lerobot_wmrl.evaluation.comparison import RESULTS, episodes_from_json
+    from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE, episodes_from_json
 
-    results = cfg.output_dir / RESULTS
+    results = cfg.output_dir / COMPARISON_FILE
     return episodes_from_json(json.loads(results.read_text())) if results.is_file() else []
 
 
@@ -135,7 +134,7 @@ def run(
     cfg: CompareConfig, claim: Claim, comparison: "Comparison", configs: "dict[str, PreTrainedConfig]"
 ) -> None:
     """Run the episodes that are missing; write the results after every batch."""
-    from lerobot_wmrl.evaluation.comparison import RESULTS
+    from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE
     from lerobot_wmrl.evaluation.policy_rollouts import (
         load_policies,
         opened,
@@ -147,7 +146,7 @@ def run(
 
     def save() -> None:
         results = {"env": claim.settings["env"], "seed": cfg.seed, **comparison.as_json()}
-        write_json(cfg.output_dir / RESULTS, results)
+        write_json(cfg.output_dir / COMPARISON_FILE, results)
 
     with (
         writing("output_dir", cfg.output_dir),

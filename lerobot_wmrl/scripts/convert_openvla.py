@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
-from lerobot_wmrl.common.errors import FieldError, renamed
+from lerobot_wmrl.common.errors import FieldError, renamed, require_choice
 from lerobot_wmrl.common.files import require_new, whole_folder, writing
 from lerobot_wmrl.common.presets import flag_as_typed
 
@@ -43,8 +43,7 @@ class ConvertOpenVLAConfig(RunConfig):
 
 def convert(cfg: ConvertOpenVLAConfig) -> None:
     """Check what is asked for, then write the target folder whole or not at all."""
-    if cfg.direction not in DIRECTIONS:
-        raise FieldError("direction", cfg.direction, f"choose one of {', '.join(DIRECTIONS)}")
+    require_choice(cfg, "direction", DIRECTIONS)
     if not cfg.source:
         raise FieldError("source", cfg.source, "give the checkpoint to convert")
     if cfg.target is None:

@@ -25,8 +25,8 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command
-from lerobot_wmrl.common.constants import EVALUATION_SEED
-from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least
+from lerobot_wmrl.common.constants import DONE_FRAMES, DONE_THRESHOLD, EVALUATION_SEED
+from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_probability
 from lerobot_wmrl.common.output_folders import Claim
 from lerobot_wmrl.common.presets import expand_preset, flag_as_typed
 from lerobot_wmrl.data.dataset import ChosenEpisodes
@@ -92,8 +92,8 @@ class EvalWorldModelConfig(RunConfig):
     split: str = "all"
     max_episodes: int = 200
     episode_length: int | None = None
-    done_threshold: float = 0.5
-    done_frames: int = 3
+    done_threshold: float = DONE_THRESHOLD
+    done_frames: int = DONE_FRAMES
     reward: GeneralConfig = field(default_factory=GeneralConfig)
     policies: list[str] = field(default_factory=list)
     policy_episodes: int = 50
@@ -107,8 +107,7 @@ class EvalWorldModelConfig(RunConfig):
         require_at_least(self, 1, "max_episodes", "done_frames", "policy_episodes")
         if self.episode_length is not None:
             require_at_least(self, 1, "episode_length")
-        if not 0 < self.done_threshold < 1:
-            raise FieldError("done_threshold", self.done_threshold, "must be a probability between 0 and 1")
+        require_probability(self, "done_threshold")
         if self.push_to_hub and Path(self.model.path).exists():
             raise FieldError(
                 "push_to_hub", True, f"{self.model.path} is a folder here",

@@ -34,7 +34,8 @@ from tqdm import tqdm
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command
-from lerobot_wmrl.common.errors import FieldError, Stopped, renamed, require_at_least
+from lerobot_wmrl.common.constants import DONE_FRAMES, DONE_THRESHOLD
+from lerobot_wmrl.common.errors import FieldError, Stopped, renamed, require_at_least, require_probability
 from lerobot_wmrl.common.files import write_json, writing
 from lerobot_wmrl.common.output_folders import Claim
 from lerobot_wmrl.data.dataset import ChosenEpisodes
@@ -86,8 +87,8 @@ class JudgeConfig(RunConfig):
     references: Path | None = None
     batch_size: int = 50
     episode_length: int | None = None
-    done_threshold: float = 0.5
-    done_frames: int = 3
+    done_threshold: float = DONE_THRESHOLD
+    done_frames: int = DONE_FRAMES
     coverage: float = 0.9
     device: str | None = None
     output_dir: Path = Path("outputs/judgement")
@@ -106,8 +107,7 @@ class JudgeConfig(RunConfig):
                 "give some that it has not learnt from, or its own data with `split=validation`",
             )  # fmt: skip
         require_at_least(self, 1, "batch_size")
-        if not 0 < self.coverage < 1:
-            raise FieldError("coverage", self.coverage, "must be a share between 0 and 1")
+        require_probability(self, "coverage")
         self._check_starts()
 
     @property
@@ -252,9 +252,9 @@ def remember(judgement: "Judgement", cfg: JudgeConfig, configs: Collection[str])
     Raises:
         ValueError: the rollouts, the world model or a policy are not what they were then.
     """
-    from lerobot_wmrl.evaluation.judgement import RESULTS, confusion_json
+    from lerobot_wmrl.evaluation.judgement import JUDGEMENT_FILE, confusion_json
 
-    results = cfg.output_dir / RESULTS
+    results = cfg.output_dir / JUDGEMENT_FILE
     if not results.is_file():
         return
     stored, now = json.loads(results.read_text()), judgement.checkpoints
@@ -283,12 +283,12 @@ def imagine(
 
     rollouts: how many there are, and so how many starts, unless others are given.
     """
-    from lerobot_wmrl.evaluation.judgement import RESULTS
+    from lerobot_wmrl.evaluation.judgement import JUDGEMENT_FILE
     from lerobot_wmrl.evaluation.policy_rollouts import about_policy, load_policies, opened, run_block
 
     def write() -> None:
         finished = configs.keys() == judgement.outcomes.keys()
-        write_json(cfg.output_dir / RESULTS, judgement.as_json(finished))
+        write_json(cfg.output_dir / JUDGEMENT_FILE, judgement.as_json(finished))
 
     most_starts = env.dataset.max_starts if cfg.starts_given else min(env.dataset.max_starts, rollouts)
     size = even_batch(most_starts, cfg.batch_size)

@@ -19,26 +19,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
+from lerobot_wmrl.common.constants import DONE_FRAMES
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import require_new, whole_folder, writing
 from lerobot_wmrl.common.lerobot_commands import edit_advice
 from lerobot_wmrl.common.presets import flag_as_typed
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import SUCCESS
-from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.play import labels  # noqa: F401 (registers `by_hand`)
 from lerobot_wmrl.rewards.success_rules import ColumnRule, EndsRule, SuccessRule, frame_positions
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-DONE_FRAMES: Final = WorldModelEnv.done_frames
-"""Frames in a row that make a success where nothing else is asked for."""
 
 
 @dataclass

@@ -36,6 +36,7 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command
+from lerobot_wmrl.common.constants import DONE_FRAMES, DONE_THRESHOLD
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least
 from lerobot_wmrl.common.files import require_new, writing
 from lerobot_wmrl.common.policies import check_weights, read_policy_config
@@ -84,8 +85,8 @@ class PlayConfig(RunConfig):
     dataset: DatasetSource = field(default_factory=DatasetSource)
     policy: PreTrainedConfig | None = None
     real_env: EnvConfig | None = None
-    done_threshold: float = 0.5
-    done_frames: int = 3
+    done_threshold: float = DONE_THRESHOLD
+    done_frames: int = DONE_FRAMES
     end_at_success: bool = True
     episode_length: int = 1000
     host: str = "127.0.0.1"

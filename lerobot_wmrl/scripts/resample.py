@@ -156,11 +156,11 @@ def episode_rows(
     dataset: "LeRobotDataset", episode: int, features: Mapping[str, Any], every: int, summed: np.ndarray
 ) -> Iterator[dict[str, Any]]:
     """Yield the rows of an episode's copy, as LeRobotDataset's `add_frame` takes them."""
-    from lerobot_wmrl.data.decoding import decode, parts_of, rows_of
+    from lerobot_wmrl.data.decoding import decode, row_parts, rows_of
 
     columns = kept_values(dataset, episode, features, every, summed)
     begin = rows_of(dataset, episode).start
-    for part in parts_of(dataset, episode):  # the frames of a long episode would not fit into the memory
+    for part in row_parts(dataset, episode):  # the frames of a long episode would not fit into the memory
         kept = [row for row in range(part.start, part.stop) if (row - begin) % every == 0]
         frames = {key: decode(dataset, episode, key, part) for key in dataset.meta.camera_keys}
         for row in kept:

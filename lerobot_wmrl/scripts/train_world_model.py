@@ -28,7 +28,7 @@ from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process, process_seed
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_choice, within
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.output_folders import CONFIG_FILE, Claim
+from lerobot_wmrl.common.output_folders import RUN_CONFIG_FILE, Claim
 from lerobot_wmrl.common.precision import PRECISIONS, keep_freed_memory, training_dtype
 from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.common.tracking import make_wandb
@@ -188,7 +188,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
 def precision_of(cfg: TrainWorldModelConfig) -> str:
     """Return the format to train in. `auto` is what the training in the output folder was begun with, which
     may have been on another machine."""
-    begun = cfg.output_dir / CONFIG_FILE
+    begun = cfg.output_dir / RUN_CONFIG_FILE
     if cfg.precision == "auto" and begun.is_file():
         return str(json.loads(begun.read_text()).get("precision", "auto"))
     return str(training_dtype(cfg.precision, cfg.model.device)).removeprefix("torch.")

@@ -12,7 +12,7 @@ from lerobot.rewards.factory import get_reward_model_class
 from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors import SafetensorError
 
-from lerobot_wmrl.common.checkpoints import UNPUBLISHED, given_revision, model_folder
+from lerobot_wmrl.common.checkpoints import UNPUBLISHED, given_revision, may_be_on_hub, model_folder
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.data.checks import check_cameras, check_depth, check_widths
 from lerobot_wmrl.data.embodiment import check_same_robot
@@ -44,7 +44,7 @@ def read_config(
     field = field or FIELDS.get(expected_type, "reward.pretrained_path")
     folder = model_folder(path)
     if not (folder / "config.json").is_file():
-        if folder.is_dir() or str(path).startswith((".", "/", "outputs")) or str(path).count("/") != 1:
+        if folder.is_dir() or not may_be_on_hub(path) or "/" not in str(path):  # none is without an owner
             raise FieldError(
                 field, path, f"no {expected_type} there", "give its training's output folder, or a hub id"
             )

@@ -22,6 +22,7 @@ from lerobot_policy_openvla.sizes import (
     ViTSizes,
     sizes_from_weights,
 )
+from lerobot_wmrl.common.checkpoints import may_be_on_hub
 
 CONFIG_FILE: Final = "config.json"
 ORIGINAL_CONFIG_FILE: Final = "openvla_config.json"
@@ -130,7 +131,7 @@ def resolve_folder(source: str | Path, revision: str | None = None) -> Path:
     folder = Path(source)
     if folder.is_dir():
         return folder
-    if folder.is_absolute() or str(source).startswith("."):
+    if not may_be_on_hub(source):
         raise ValueError(f"{source}: no such folder")
     patterns = [CONFIG_FILE, *COMPANIONS, ORIGINAL_CONFIG_FILE, "*.safetensors", SAFETENSORS_INDEX_FILE]
     try:

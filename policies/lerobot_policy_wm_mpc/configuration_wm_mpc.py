@@ -6,6 +6,7 @@ from typing import Final
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.types import NormalizationMode
 
+from lerobot_wmrl.common.constants import DONE_FRAMES
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
 from lerobot_wmrl.common.policy_configuration import SingleStepConfig
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
@@ -39,7 +40,7 @@ class WmMpcConfig(PlannerSettings, SingleStepConfig):
     proposal_path: str = ""
     text_world_model_path: str = ""
     objective: str = "success"
-    done_frames: int = 3
+    done_frames: int = DONE_FRAMES
     seed: int = 0
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 from lerobot.robots import RobotConfig
 
+from lerobot_wmrl.common.constants import DONE_FRAMES, DONE_THRESHOLD
 from lerobot_wmrl.common.errors import FieldError, require_positive
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 
@@ -44,8 +45,8 @@ class ImaginedRobotConfig(RobotConfig):
     dataset: EveryStart = field(default_factory=EveryStart)
     first_start: int = 0
     episode_time_s: float | None = None
-    done_threshold: float = 0.5
-    done_frames: int = 3
+    done_threshold: float = DONE_THRESHOLD
+    done_frames: int = DONE_FRAMES
     suffix: str = ""
     device: str | None = None
 

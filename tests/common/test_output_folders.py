@@ -4,14 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_wmrl.common.output_folders import CONFIG_FILE, Claim
+from lerobot_wmrl.common.output_folders import RUN_CONFIG_FILE, Claim
 
 
 def test_a_run_that_was_killed_while_it_claimed_its_folder_claims_it_again(tmp_path: Path) -> None:
-    (tmp_path / f".{CONFIG_FILE}.partial").write_text("{")
+    (tmp_path / f".{RUN_CONFIG_FILE}.partial").write_text("{")
     for _ in range(2):
         with Claim(tmp_path, {"seed": 1}).held():
-            assert (tmp_path / CONFIG_FILE).is_file()
+            assert (tmp_path / RUN_CONFIG_FILE).is_file()
 
 
 def test_other_settings_are_refused_by_name_but_for_those_that_may_differ(tmp_path: Path) -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_wmrl.data.resumable_array import Units, memory_map
+from lerobot_wmrl.data.resumable_array import WritePlan, memory_map
 
 
-def counted(written: list[int], stop_at: int | None = None, by: type = KeyboardInterrupt) -> Units:
+def counted(written: list[int], stop_at: int | None = None, by: type = KeyboardInterrupt) -> WritePlan:
     """Return five units, each of which writes its number into two rows."""
 
     def write(target: np.ndarray, number: int) -> None:
@@ -21,7 +21,7 @@ def counted(written: list[int], stop_at: int | None = None, by: type = KeyboardI
         written.append(number)
         target[2 * number : 2 * number + 2] = number
 
-    return Units(5, write, "Counting")
+    return WritePlan(5, write, "Counting")
 
 
 def test_a_cache_whose_writing_was_stopped_goes_on(tmp_path: Path) -> None:

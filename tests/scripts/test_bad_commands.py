@@ -79,7 +79,7 @@ ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
     (judge, ["--policies=[{cnn}]", *JUDGED, "--references={foreign}/thesis.txt"], "no success of policies"),
     (compare, [TWO, *SIMULATOR, "--n_episodes=0"], "--n_episodes=0: must be at least 1"),
     (compare, [TWO, *SIMULATOR, "--n_episodes=3"], "--batch_size=4: there are 3 episodes; lower it"),
-    (compare, [TWO, *SIMULATOR, "--alpha=1"], "--alpha=1.0: must be a probability"),
+    (compare, [TWO, *SIMULATOR, "--alpha=1"], "--alpha=1.0: must be above 0 and below 1"),
     (compare, [*FITTING, "--output_dir={foreign}"], "foreign: holds something else"),
     (convert_openvla, ["--direction=sideways", NEW], "--direction=sideways: choose one of import"),
     (convert_openvla, ["--direction=import", NEW], "--source: give the checkpoint to convert"),

@@ -13,7 +13,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors.torch import load_file
 
-from lerobot_wmrl.common.output_folders import LOCK, locked
+from lerobot_wmrl.common.output_folders import LOCK, hold_lock
 from lerobot_wmrl.common.presets import PRESETS
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -116,7 +116,7 @@ def test_a_training_that_another_command_continues_is_left_alone(
     flags = [f"--policy.path={policy}", *SHORT, f"--output_dir={output_dir}", *POINT]
     improve(monkeypatch, *flags)
     shutil.rmtree(output_dir / "checkpoints" / "000002")
-    with locked(output_dir, output_dir / LOCK), pytest.raises(SystemExit):
+    with hold_lock(output_dir, output_dir / LOCK), pytest.raises(SystemExit):
         improve(monkeypatch, *flags)
     assert "another command writes there" in capsys.readouterr().err
     assert not (output_dir / "checkpoints" / "000002").exists()

@@ -15,7 +15,7 @@ from transformers import BertConfig
 
 from lerobot_wmrl.common.checkpoints import model_folder
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.output_folders import CONFIG_FILE
+from lerobot_wmrl.common.output_folders import RUN_CONFIG_FILE
 from lerobot_wmrl.world_models import losses
 from lerobot_wmrl.world_models.checkpoint import config_to_continue, load_model, load_model_to_continue
 from lerobot_wmrl.world_models.goal import imagine_goal
@@ -96,7 +96,7 @@ def test_a_checkpoint_carries_its_frozen_t5_in_files_that_lerobot_publishes(trai
 def test_training_goes_on_where_the_t5s_own_folder_is_gone(trained, small_dataset, tmp_path):
     output_dir = shutil.copytree(trained, tmp_path / "run", symlinks=True)
     shutil.rmtree(output_dir / "checkpoints" / "000002")
-    given = json.loads((output_dir / CONFIG_FILE).read_text())["model"]
+    given = json.loads((output_dir / RUN_CONFIG_FILE).read_text())["model"]
     config = text_config(given["tokenizer_path"], text_encoder=given["text_encoder"])
     run_training(config, Path(small_dataset.root), output_dir, steps=2)
     expected, resumed = load_file(trained / WEIGHTS), load_file(output_dir / WEIGHTS)

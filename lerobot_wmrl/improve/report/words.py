@@ -11,7 +11,7 @@ from lerobot_wmrl.evaluation.comparison import Pair
 from lerobot_wmrl.evaluation.gate import DOUBTFUL_AUC
 from lerobot_wmrl.evaluation.report import seen_line
 from lerobot_wmrl.improve.findings import few_failures, one_sided_tasks
-from lerobot_wmrl.improve.plan import DONE_THRESHOLD
+from lerobot_wmrl.improve.plan import STRICT_DONE_THRESHOLD
 from lerobot_wmrl.improve.progress import CLONED, SFT, Progress
 from lerobot_wmrl.improve.results import (
     Place,
@@ -239,7 +239,7 @@ def taken_instead(progress: Progress) -> str:
         return ""
     false, recall = gate_rates(point)
     return (
-        f" Recall is 0 at done_threshold={DONE_THRESHOLD}: imagination took "
+        f" Recall is 0 at done_threshold={STRICT_DONE_THRESHOLD}: imagination took "
         f"done_threshold={point['done_threshold']} and done_frames={point['done_frames']}, chosen on the "
         f"same episodes (false positives {false}, recall {recall})."
     )
