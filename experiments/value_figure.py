@@ -41,7 +41,7 @@ def draw_value(load: Load, path: Path) -> None:
             for number, method in enumerate(methods)
         ]
         axes.set_title(f"{DOMAINS[domain]} scenes")
-        axes.set_xlabel("real episodes: demonstrations + rollouts")
+        axes.set_xlabel("episodes in ManiSkill: demonstrations + rollouts")
         axes.set_xticks(range(len(found)), [f"{d} + {r}" for d, r in sorted(found)])
     panels[0].set_ylabel("success in ManiSkill")
     titles = [TITLES[method] for method in methods]
