@@ -11,10 +11,11 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 import torch
+from lerobot.configs.video import DepthEncoderConfig
 from lerobot.datasets.depth_utils import MM_PER_METRE
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import HF_LEROBOT_HOME
@@ -28,6 +29,9 @@ from lerobot_wmrl.data.checks import depth_key
 from lerobot_wmrl.data.decoding import decode, decode_depth, row_parts
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.data.resumable_array import WritePlan, batches, memory_map
+
+ROUNDING_METRES: Final = 1e-4
+"""Metres by which a depth may differ from the one that stands for no measurement."""
 
 
 class FrameEncoder(Protocol):
@@ -221,10 +225,21 @@ def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int)
     return memory_map(cache_dir(dataset) / f"depth-{key}.npy", shape, np.float32, episodes)
 
 
-def depth_of_windows(batch: Mapping[str, Any], camera_keys: Sequence[str], grid: int) -> Tensor:
+def unmeasured_depth(features: Mapping[str, Any], camera_keys: Sequence[str]) -> list[float]:
+    """Return the metres that LeRobot gives for pixels without a measurement: a video's least depth, else 0."""
+    described = [features[depth_key(camera)] for camera in camera_keys]
+    return [
+        DepthEncoderConfig.from_video_info(each.get("info") or {}).depth_min if each["dtype"] == "video" else 0.0
+        for each in described
+    ]
+
+
+def depth_of_windows(
+    batch: Mapping[str, Any], camera_keys: Sequence[str], grid: int, unmeasured: Sequence[float]
+) -> Tensor:
     """Average depth maps in millimetres, as lerobot-train gives them, to metres a token.
 
-    (B, T, 1, H, W) of each camera → (B, T, S)
+    (B, T, 1, H, W) of each camera → (B, T, S). `unmeasured`: what stands for no measurement, in metres.
 
     Raises:
         FieldError: the depth of a camera is missing.
@@ -232,6 +247,8 @@ def depth_of_windows(batch: Mapping[str, Any], camera_keys: Sequence[str], grid:
     missing = [name for name in map(depth_key, camera_keys) if name not in batch]
     if missing:
         raise FieldError("depth", True, f"the batch lacks {missing}", "use a dataset recorded with depth")
-    maps = [batch[depth_key(camera)].float() / MM_PER_METRE for camera in camera_keys]
+    given = [batch[depth_key(camera)].float() / MM_PER_METRE for camera in camera_keys]
+    least = [none + ROUNDING_METRES for none in unmeasured]
+    maps = [torch.where(each > at, each, 0.0) for each, at in zip(given, least, strict=True)]
     cameras = [token_depth(each.flatten(0, 1), grid).unflatten(0, each.shape[:2]) for each in maps]
     return torch.cat(cameras, 2)

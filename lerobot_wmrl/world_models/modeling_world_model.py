@@ -22,7 +22,7 @@ from lerobot_wmrl.data.checks import check_cameras, check_depth, check_episode_l
 from lerobot_wmrl.data.clips import Clip, clip_from_windows
 from lerobot_wmrl.data.embodiment import check_range, read_embodiment
 from lerobot_wmrl.data.episodes import success_column
-from lerobot_wmrl.data.frame_cache import depth_of_windows
+from lerobot_wmrl.data.frame_cache import depth_of_windows, unmeasured_depth
 from lerobot_wmrl.world_models.anchored.dynamics import AnchoredDynamics
 from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.autoregressive.dynamics import AutoregressiveDynamics
@@ -63,7 +63,11 @@ gripper or the rotation of a hand held upright hardly varies: scaled by less, it
 centimetres."""
 
 STATE_LIMIT: Final = 5.0
-"""Standard deviations to which the normalised state is clamped."""
+"""Standard deviations to which the normalised state is clamped, or as far as the data goes beyond: a gripper
+that is seldom open, a pose that episodes begin with."""
+
+FARTHEST_STATE: Final = 50.0
+"""Standard deviations beyond which a recorded state is taken for an error of measurement."""
 
 UNLABELLED_DONE: Final = -5.0
 """Initial logit of done where the dataset does not say what success is. Nothing trains done then, and at a
@@ -98,6 +102,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
     name = "world_model"
     state_mean: Tensor
     state_std: Tensor
+    state_limit: Tensor
 
     def __init__(
         self, config: WorldModelConfig, dataset_stats: Any = None, dataset_meta: Any = None, **kwargs: Any
@@ -108,6 +113,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         if dataset_meta is not None:
             check_episode_lengths(dataset_meta)
         source = self._adopt_tokenizer() if config.tokenizer_path else None
+        self._unmeasured: list[float] = []  # known with the dataset
         if dataset_meta is not None:
             self._adopt_dataset(dataset_meta)
         sizes: Any = config.tokenizer  # given, or adopted above
@@ -123,6 +129,25 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         elif dataset_meta is not None and success_column(dataset_meta.features) is None:
             nn.init.constant_(done[-1].bias, UNLABELLED_DONE)
         self._register_statistics("state", OBS_STATE, config.state_size, dataset_stats, STATE_SPREAD)
+        self.register_buffer("state_limit", self._state_limit(dataset_stats))
+
+    def _state_limit(self, stats: Any) -> Tensor:
+        """Return the standard deviations to which each component of the state is clamped. (P,)"""
+        if stats is None or not self.config.state_size or "max" not in stats[OBS_STATE]:
+            return torch.full_like(self.state_std, STATE_LIMIT)
+        ends = [torch.as_tensor(stats[OBS_STATE][end], dtype=torch.float32) for end in ("min", "max")]
+        reach = torch.stack([(end - self.state_mean).abs() / self.state_std for end in ends]).amax(0)
+        if wrong := [str(index) for index in torch.nonzero(~(reach <= FARTHEST_STATE)).flatten().tolist()]:
+            logging.warning(
+                "observation.state: components %s reach more than %d standard deviations from their mean, "
+                "and are clipped there; look for errors of measurement", ", ".join(wrong), FARTHEST_STATE,
+            )  # fmt: skip
+        return reach.nan_to_num(FARTHEST_STATE).clamp(STATE_LIMIT, FARTHEST_STATE)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """Read checkpoints of versions that clamped every component to `STATE_LIMIT` as well."""
+        state_dict.setdefault(f"{prefix}state_limit", torch.full_like(self.state_std, STATE_LIMIT))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def train(self, mode: bool = True) -> "WorldModelRewardModel":
         """Keep the tokenizer, which is fixed, in evaluation mode."""
@@ -146,6 +171,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         self.config.tokenizer = with_frame_sizes(sizes, features)
         if self.config.depth:
             check_depth(features, sizes.camera_keys)
+            self._unmeasured = unmeasured_depth(features, sizes.camera_keys)
         if self.config.state_size and OBS_STATE not in features:
             logging.info("the dataset has no observation.state: the world model does without it")
         elif self.config.state_size:
@@ -173,10 +199,10 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
     def normalize_state(self, state: Tensor) -> Tensor:
         """Dataset units (…, P) to zero mean and unit spread.
 
-        Clipped, so that rare collisions do not outweigh the rest. Without proprioception → (…, 0).
+        Clipped to what was recorded, `state_limit`. Without proprioception → (…, 0).
         """
         state = state[..., : self.config.state_size]
-        return ((state - self.state_mean) / self.state_std).clamp(-STATE_LIMIT, STATE_LIMIT)
+        return ((state - self.state_mean) / self.state_std).clamp(-self.state_limit, self.state_limit)
 
     @torch.no_grad()
     def instruction_weights(self, instructions: Sequence[str], batch: int) -> Tensor | None:
@@ -226,7 +252,8 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         tokens = self.tokenizer.encode(images.flatten(0, 1), context[rows]).unflatten(0, shape)
         depth = None
         if self.config.depth:
-            depth = depth_of_windows(batch, sizes.camera_keys, self.tokenizer.grid)
+            unmeasured = self._unmeasured or [0.0] * len(sizes.cameras)
+            depth = depth_of_windows(batch, sizes.camera_keys, self.tokenizer.grid, unmeasured)
         features = None
         if self.config.predicts_success:
             first = images[:, :1].expand_as(images)

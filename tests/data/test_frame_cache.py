@@ -18,7 +18,7 @@ from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data import decoding, frame_cache
 from lerobot_wmrl.data.checks import check_cameras
 from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
-from lerobot_wmrl.data.frame_cache import cached_depth, depth_of_windows, token_depth
+from lerobot_wmrl.data.frame_cache import cached_depth, depth_of_windows, token_depth, unmeasured_depth
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
@@ -96,12 +96,37 @@ def test_depth_stored_as_images_is_read_in_its_unit(dtype, unit, tmp_path, monke
     np.testing.assert_allclose(found, factor * unit / 1000 * squares(maps) * (1000 / unit), rtol=1e-3)
 
 
+def test_what_was_not_measured_does_not_count_in_a_batch_of_lerobot_train_either(tmp_path):
+    """LeRobot gives such pixels of a video its least depth, 1 cm by default."""
+    depth_map = {
+        "dtype": "video", "shape": (SIZE, SIZE, 1), "names": ["height", "width", "channels"],
+        "info": {"is_depth_map": True},
+    }  # fmt: skip
+    dataset = LeRobotDataset.create(
+        "local/holes", FPS, {f"{CAMERA}_depth": depth_map}, root=tmp_path / "holes"
+    )
+    holes = np.full((SIZE, SIZE, 1), 1000, np.uint16)
+    holes[:8, :8] = 0
+    holes[8:16, 8:12] = 0
+    for _ in range(3):
+        dataset.add_frame({f"{CAMERA}_depth": holes, "task": "look"})
+    dataset.save_episode()
+    dataset.finalize()
+    stored = open_dataset(tmp_path / "holes")
+    batch = {f"{CAMERA}_depth": torch.stack([stored[row][f"{CAMERA}_depth"] for row in range(3)])[None]}
+    assert 0 < batch[f"{CAMERA}_depth"].min() < 11
+    depth = depth_of_windows(batch, [CAMERA], GRID, unmeasured_depth(stored.features, [CAMERA]))[0]
+    assert (depth[:, 0] == 0).all()
+    assert depth[:, 1:].min() > 0.9
+    np.testing.assert_allclose(depth, cached_depth(stored, [CAMERA], GRID), atol=1e-3)
+
+
 def test_cameras_may_have_depth_of_different_sizes():
     batch = {
         "top_depth": torch.full((2, 3, 1, 16, 16), 1000),
         "wrist_depth": torch.full((2, 3, 1, 8, 12), 2000),
     }
-    depth = depth_of_windows(batch, ["top", "wrist"], GRID)
+    depth = depth_of_windows(batch, ["top", "wrist"], GRID, [0.01, 0.0])
     assert torch.equal(depth, torch.tensor([1.0, 2.0]).repeat_interleave(GRID**2).expand(2, 3, -1))
 
 
