@@ -80,7 +80,7 @@ class Entries:
         spent = self.spent()
         for name, limit in asdict(self.limits).items():
             count, left = wanted.get(name, 0), limit - spent[name]
-            if count > left:
+            if count and count > left:
                 raise FieldError(
                     "budget", path, f"{count} more {name} are wanted, {left} of {limit} are left",
                     "record fewer, or give every method that is compared a larger limit",

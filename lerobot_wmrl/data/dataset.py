@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import pyarrow.dataset
+from huggingface_hub.file_download import repo_folder_name
 from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import EPISODES_DIR, BackwardCompatibilityError
+from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
 from lerobot.utils.utils import SuppressProgressBars
 
 from lerobot_wmrl.common.errors import FieldError, first_line, renamed
@@ -168,6 +170,12 @@ def download_dataset(repo_id: str, revision: str | None = None, root: str | None
             "`dataset.root`",
         ) from error  # fmt: skip
     return with_whole_rate(dataset, "dataset.repo_id", repo_id)
+
+
+def local_copies(repo_id: str) -> list[Path]:
+    """Return the folders in LeRobot's cache that hold a dataset of the hub, one a revision."""
+    cached = HF_LEROBOT_HUB_CACHE / repo_folder_name(repo_id=repo_id, repo_type="dataset") / "snapshots"
+    return sorted(path for path in cached.glob("*") if path.is_dir())
 
 
 def older_format(field: str, value: object, repo_id: str, root: str | Path) -> FieldError:

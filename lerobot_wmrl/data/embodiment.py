@@ -13,7 +13,7 @@ import numpy as np
 from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import read_actions
+from lerobot_wmrl.data.episodes import parquet_files, read_actions
 
 POSITION_NAMES: Final = ("tcp_x", "tcp_y", "tcp_z")
 """First components of a state that begins with the position of the tool centre point (TCP, m)."""
@@ -137,6 +137,11 @@ def observed_range(meta: Any) -> tuple[list[float], list[float]]:
     distance between the 1 % and the 99 % quantile. A component whose quantiles are the same, such as a
     gripper that hardly ever moves, keeps its extremes.
     """
+    if not parquet_files(Path(meta.root)):
+        raise FieldError(
+            "dataset.root", meta.root, "has no files of data here, which say in what range its actions are",
+            "download it: leave out `--dataset.streaming`",
+        )  # fmt: skip
     actions = read_actions(Path(meta.root))
     finite = actions[np.isfinite(actions).all(1)]
     if not len(finite):

@@ -13,6 +13,7 @@ from torch import Tensor
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import to_pixels
+from lerobot_wmrl.data.checks import shows_colours
 from lerobot_wmrl.data.embodiment import HIGH, LOW, Embodiment
 
 
@@ -98,7 +99,7 @@ def video_info(feature: Mapping[str, Any]) -> dict[str, Any]:
 
 def encoder_of(columns: Mapping[str, Any]) -> RGBEncoderConfig | None:
     """Return the encoder of a dataset's videos, with which others can be merged; None if it has none."""
-    videos = [feature for feature in columns.values() if feature["dtype"] == "video"]
+    videos = [each for each in columns.values() if each["dtype"] == "video" and shows_colours(each)]
     return RGBEncoderConfig.from_video_info(video_info(videos[0])) if videos else None
 
 

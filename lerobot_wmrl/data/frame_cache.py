@@ -30,6 +30,9 @@ from lerobot_wmrl.data.decoding import decode, decode_depth, row_parts
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.data.resumable_array import WritePlan, batches, memory_map
 
+FAR: Final = 2.5
+"""Metres: what is further away counts as that far, as in the recorder's depth maps."""
+
 ROUNDING_METRES: Final = 1e-4
 """Metres by which a depth may differ from the one that stands for no measurement."""
 
@@ -170,7 +173,8 @@ def frames_to_tensor(frames: np.ndarray) -> Tensor:
 
 
 def file_stamps(dataset: LeRobotDataset) -> list[object]:
-    """Return names, sizes and times of the dataset's files: a new recording needs caches of its own."""
+    """Return names, sizes and times of the dataset's files, and its fps, by which frames are found in videos:
+    a new recording needs caches of its own."""
     root = Path(dataset.root)
     files = sorted(
         path
@@ -178,7 +182,8 @@ def file_stamps(dataset: LeRobotDataset) -> list[object]:
         for path in files_below(root / each)
         if path.suffix in (".mp4", ".parquet")
     )
-    return [item for path in files for item in (path.name, path.stat().st_size, path.stat().st_mtime_ns)]
+    stamps = [item for path in files for item in (path.name, path.stat().st_size, path.stat().st_mtime_ns)]
+    return [dataset.fps, *stamps]
 
 
 def files_below(root: Path) -> Iterator[Path]:
@@ -226,12 +231,14 @@ def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int)
 
 
 def unmeasured_depth(features: Mapping[str, Any], camera_keys: Sequence[str]) -> list[float]:
-    """Return the metres that LeRobot gives for pixels without a measurement: a video's least depth, else 0."""
-    described = [features[depth_key(camera)] for camera in camera_keys]
-    return [
-        DepthEncoderConfig.from_video_info(each.get("info") or {}).depth_min if each["dtype"] == "video" else 0.0
-        for each in described
-    ]
+    """Return the metres that LeRobot gives for pixels without a measurement: a video's least depth, or 0."""
+
+    def least(feature: Mapping[str, Any]) -> float:
+        if feature["dtype"] != "video":
+            return 0.0
+        return float(DepthEncoderConfig.from_video_info(feature.get("info") or {}).depth_min)
+
+    return [least(features[depth_key(camera)]) for camera in camera_keys]
 
 
 def depth_of_windows(

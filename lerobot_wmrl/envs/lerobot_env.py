@@ -113,6 +113,19 @@ def check_real_env(policy: PreTrainedConfig, config: EnvConfig, starts: int = 0)
     check_fit(policy, sized, env.single_action_space.shape[0], "real_env")
 
 
+def frame_limit(config: EnvConfig) -> int:
+    """Return the most frames of an episode of `real_env`, of which one a task is made to ask it: LeRobot's
+    rollouts go by the environment, and some configurations say something else (Meta-World's)."""
+    if isinstance(config, WmrlManiSkillEnv):
+        return config.horizon
+    with within("real_env"):
+        envs = [env for members in _members(config, 1) for env in members]
+        limits = [_frame_limit(config, env) for env in envs]
+    for env in envs:
+        env.close()
+    return max(limits)
+
+
 def check_frame_rate(config: EnvConfig, fps: int, where: str) -> None:
     """Raise FieldError unless `real_env` has as many frames a second as the data that is learnt from."""
     if config.fps != fps:
@@ -158,7 +171,7 @@ class LeRobotTensorEnv(TensorEnv):
             self.widen(*learnt)
 
     def widen(self, low: Tensor, high: Tensor) -> None:
-        """Let actions reach as far as those that a policy has learnt from, (A,) each; warn where that is new.
+        """Let actions reach as far as those that were learnt from, (A,) each; warn where that is new.
 
         LeRobot does not clip actions, and an environment may take more than its action space says: Aloha
         takes joint angles, and its space is that from −1 to 1.
@@ -166,8 +179,8 @@ class LeRobotTensorEnv(TensorEnv):
         beyond = ((low < self.action_low) | (high > self.action_high)).nonzero().flatten().tolist()
         if beyond:
             logging.warning(
-                "env.type=%s: the policy has learnt actions beyond the environment's action space, and may "
-                "take them: %s. Are they in the same units?", self.kind, ", ".join(
+                "env.type=%s: actions were learnt beyond the environment's action space, and may be taken "
+                "there: %s. Are they in the same units?", self.kind, ", ".join(
                     f"component {at} {low[at]:.4g} to {high[at]:.4g} (in the environment "
                     f"{self.action_low[at]:.4g} to {self.action_high[at]:.4g})"
                     for at in beyond

@@ -97,6 +97,10 @@ class TensorEnv(gym.vector.VectorEnv):
             observation = self._restart(ended, outcome)
         return observation, outcome.reward, outcome.terminated, outcome.truncated, info
 
+    def widen(self, low: Tensor, high: Tensor) -> None:
+        """Let actions reach as far as those that were learnt from, (A,) each, where an environment may take
+        more than its action space says; by default its range stays as it is."""
+
     def accept(self, policy: LoadedPolicy) -> None:
         """Make ready for a policy's actions. FieldError if they are in other units than the environment's."""
 

@@ -15,7 +15,7 @@ from lerobot_wmrl.common.constants import DYNA, START_SCENE
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.output_folders import RUN_CONFIG_FILE
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
+from lerobot_wmrl.data.dataset import DatasetSource, local_copies, open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, choose_episodes, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.evaluation.calibration import Confusion
@@ -175,22 +175,22 @@ def learnt_from(world_model: str, rollouts: LabelledRollouts) -> int:
     Trainings that it was continued from count too, as far as their settings and data lie on this machine.
     """
     sources = [settings.get("dataset") or {} for _, settings in _trainings(world_model, "model")]
-    learnt = [
-        (str(root), episodes)
-        for source in sources
-        for root, episodes in (
-            (source.get("root") or source.get("repo_id"), source.get("episodes")),
-            *((more, None) for more in source.get("more", ())),
-        )
-        if root
-    ]
+    learnt = [(root, source.get("episodes")) for source in sources for root in _folders(source)]
+    learnt += [(str(more), None) for source in sources for more in source.get("more", ())]
     table, chosen = rollouts.table, rollouts.chosen
-    same = [root == rollouts.name or _same(Path(root), Path(rollouts.name)) for root, _ in learnt]
+    same = [_same(Path(root), rollouts.root) for root, _ in learnt]
     if any(same):
         parts = [table.training(episodes) for (_, episodes), equal in zip(learnt, same, strict=True) if equal]
         return int(np.any(parts, axis=0)[chosen].sum())
     digests = (digest for root, episodes in learnt for digest in learnt_digests(Path(root), episodes))
     return len(action_digests(table, chosen) & {*digests})
+
+
+def _folders(source: Mapping[str, Any]) -> list[str]:
+    """Return where the dataset that a training was given lies on this machine."""
+    if source.get("root"):
+        return [str(source["root"])]
+    return [str(path) for path in local_copies(source["repo_id"])] if source.get("repo_id") else []
 
 
 def learnt_digests(root: Path, episodes: Sequence[int] | None) -> set[str]:

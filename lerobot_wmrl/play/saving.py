@@ -108,7 +108,7 @@ def replacing(folder: Path) -> Iterator[Path]:
     partial, old = beside(folder)
     partial.parent.mkdir(parents=True, exist_ok=True)
     with exclusive(folder):
-        shutil.rmtree(partial, ignore_errors=True)
+        put_back(folder)
         if folder.is_dir() and any(folder.iterdir()):
             shutil.copytree(folder, partial, copy_function=link_or_copy)
         yield partial
@@ -133,10 +133,16 @@ def recover(folder: Path) -> None:
     if not (partial.exists() or old.exists()):
         return
     with exclusive(folder):
-        if old.is_dir() and not folder.exists():
-            old.replace(folder)
-        for leftover in (partial, old):
-            shutil.rmtree(leftover, ignore_errors=True)
+        put_back(folder)
+
+
+def put_back(folder: Path) -> None:
+    """Undo a replacement that was interrupted; to be called while the folder is held."""
+    partial, old = beside(folder)
+    if old.is_dir() and not folder.exists():
+        old.replace(folder)
+    for leftover in (partial, old):
+        shutil.rmtree(leftover, ignore_errors=True)
 
 
 def exclusive(folder: Path) -> AbstractContextManager[None]:

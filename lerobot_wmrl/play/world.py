@@ -148,6 +148,9 @@ class World:
                 f"takes actions of {count} components, the world model has learnt {wanted}",
                 "give the environment that its dataset is from",
             )  # fmt: skip
+        if self.model.embodiment.action_low:
+            ends = self.model.embodiment.action_low, self.model.embodiment.action_high
+            env.widen(*(torch.tensor(end, dtype=torch.float32) for end in ends))
         return env
 
     def begin(self, place: Mapping[str, Any], real_env: Any) -> Drive:
@@ -172,6 +175,12 @@ class World:
             seed = whole_number("seed", place["seed"], LARGEST_SEED)
             real = RealEpisode(self.real_env.type, real_env, seed)
             start = observed_frame(real.observation, self.sizes)
+            if self.model.state_size not in (0, count := start.state.shape[1]):
+                raise FieldError(
+                    "real_env.type", self.real_env.type,
+                    f"has a state of {count} components, the world model has learnt {self.model.state_size}",
+                    "give the environment that its dataset is from",
+                )  # fmt: skip
         else:
             start = self._uploaded(place)
         if wanted:
@@ -257,6 +266,11 @@ def load_world(
     if dataset.given:
         world.table = read_episodes(dataset.open())
         check_dataset(world.model, world.table.dataset.meta)
+    if policy is not None and hasattr(policy, "proposal_path"):
+        raise FieldError(
+            "policy.path", policy.pretrained_path, f"{policy.type} plans in a world model, as the page does",
+            "leave it out, or give the policy that it improves on (`proposal_path`)",
+        )  # fmt: skip
     if policy is not None:
         fit_to_environment(policy, world.model.observation_shapes, world.model.action_size)
         world.policy = LoadedPolicy.load(policy)

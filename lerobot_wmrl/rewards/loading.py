@@ -40,7 +40,7 @@ def load_reward(config: RewardModelConfig, model: ActionWorldModelRewardModel, l
     Raises:
         FieldError: the reward does not fit the world model, or has to be trained first.
     """
-    device = model.device.type
+    device = str(model.device)
     if isinstance(config, GeneralConfig):
         return make_reward_model(replace(config, gamma=potential_discount(config, longest)))
     if not isinstance(config, LearnedRewardConfig):

@@ -84,7 +84,7 @@ class DynaRounds:
 
     def apply(self, records: Mapping[int, Record]) -> None:
         """Give the environment the world model of the latest round."""
-        model = load_model(self._world_model(max(records)), WORLD_MODEL, self.env.device.type)
+        model = load_model(self._world_model(max(records)), WORLD_MODEL, str(self.env.device))
         self.env.adopt(model)
 
     def _new_datasets(self, iteration: int, checkpoint: Path, folder: Path) -> list[Path]:
@@ -126,7 +126,7 @@ class DynaRounds:
         if number:
             initial = str(self._world_model(self.iterations[number - 1]))
         flags: Flags = {
-            "model.path": initial, "model.device": self.env.device.type, **self.learnt.flags(),
+            "model.path": initial, "model.device": str(self.env.device), **self.learnt.flags(),
             "dataset.more": more, "model.learning_rate": LEARNING_RATE,
             "steps": self.config.steps, "batch_size": self.config.batch_size,
             "save_freq": max(1, self.config.steps // 4), "seed": self.seed + number,

@@ -51,7 +51,7 @@ def make_recorder(settings: CallbackSettings, env: WorldModelVectorEnv) -> Recor
         return None
     if not isinstance(simulator, WmrlManiSkillEnv):
         num_envs = settings.real_num_envs
-        return EnvRecorder(simulator, model.embodiment, env.device.type, settings.budget, num_envs)
+        return EnvRecorder(simulator, model.embodiment, str(env.device), settings.budget, num_envs)
     cameras = list(dict.fromkeys([*simulator.cameras, *model.tokenizer.cameras]))
     return ManiSkillRecorder(simulator, settings.real_num_envs, cameras, model.depth, settings.budget)
 

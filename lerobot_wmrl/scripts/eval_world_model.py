@@ -272,6 +272,7 @@ def policies_imagination(cfg: EvalWorldModelConfig, table: "EpisodeTable") -> "W
     """
     from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
     from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+    from lerobot_wmrl.envs.lerobot_env import frame_limit
     from lerobot_wmrl.envs.start_frames import chosen_episodes
 
     tasks = cfg.real_env.task_names if isinstance(cfg.real_env, WmrlManiSkillEnv) else None
@@ -281,7 +282,8 @@ def policies_imagination(cfg: EvalWorldModelConfig, table: "EpisodeTable") -> "W
             "choose one",
         )  # fmt: skip
     starts = StartFrames(**vars(cfg.dataset), split=cfg.split, tasks=tasks, max_starts=cfg.policy_episodes)
-    longest = getattr(cfg.real_env, "horizon", None) or getattr(cfg.real_env, "episode_length", None)
+    assert cfg.real_env is not None, "the settings were checked"
+    longest = frame_limit(cfg.real_env)
     with renamed("world_model_path", "model.path"):
         imagination = WorldModelEnv(
             world_model_path=cfg.model.path, reward=GeneralConfig(alpha=1.0), device=cfg.device,

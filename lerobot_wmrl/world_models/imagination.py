@@ -11,7 +11,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
 from lerobot_wmrl.common.precision import compute_in, imagination_dtype
-from lerobot_wmrl.data.frame_cache import cached_depth
+from lerobot_wmrl.data.frame_cache import FAR, cached_depth
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
 from lerobot_wmrl.world_models.condition import Condition
 from lerobot_wmrl.world_models.dynamics import (
@@ -40,11 +40,11 @@ class ImaginationMixin:
         return self.state_mean.device
 
     def recorded_depth(self, dataset: LeRobotDataset, rows: Any) -> Tensor | None:
-        """Return the depth (…, S) in metres of rows of a dataset, None for a model without depth."""
+        """Return the depth (…, S) in metres of rows of a dataset, at most `FAR`; None for a model without."""
         if not self.config.depth:
             return None
         depth = cached_depth(dataset, self.config.tokenizer.camera_keys, self.tokenizer.grid)[rows]
-        return torch.from_numpy(np.array(depth)).to(self.device)
+        return torch.from_numpy(np.array(depth)).clamp_max(FAR).to(self.device)
 
     @torch.no_grad()
     def start(

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policy_checks import check_units
+from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.data.checks import check_cameras, check_depth, check_episode_lengths, check_statistics
 from lerobot_wmrl.data.clips import Clip, clip_from_windows
 from lerobot_wmrl.data.embodiment import check_range, read_embodiment
@@ -211,7 +212,8 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         check_one_each(instructions, batch)
         classifier: Any = self.tokenizer.success
         for text in set(instructions) - self._instruction_weights.keys():  # the tokenizer is fixed
-            self._instruction_weights[text] = classifier.instructions([text])[0]
+            with compute_in(torch.float32, self.device):  # kept: the same for trainings in bfloat16
+                self._instruction_weights[text] = classifier.instructions([text])[0]
         device = self.device
         return torch.stack([self._instruction_weights[text].to(device) for text in instructions])
 

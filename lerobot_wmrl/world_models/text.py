@@ -20,6 +20,7 @@ from transformers import (
 from transformers.tokenization_utils_base import VERY_LARGE_INTEGER
 
 from lerobot_wmrl.common.errors import FieldError, first_line
+from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.world_models.condition import Condition
 
 MAX_TOKENS: Final = 512
@@ -151,7 +152,8 @@ class FrozenT5:
     def _embed(self, instruction: str, device: torch.device) -> Tensor:
         """Return the last hidden states (M, width) of one instruction's tokens in float32."""
         batch = tokenize(self.tokenizer, [instruction]).to(device)
-        return self.model.to(device)(**batch).last_hidden_state[0].float()
+        with compute_in(torch.float32, device):  # as loaded, also for trainings in bfloat16
+            return self.model.to(device)(**batch).last_hidden_state[0].float()
 
 
 class TextEncoder(nn.Module):

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 import torch
@@ -38,6 +38,7 @@ from lerobot_wmrl.data.clips import ClipSampler, FrameSampler, InTurn
 from lerobot_wmrl.data.dataset import TrainingData
 from lerobot_wmrl.data.episodes import EpisodeTable, count_tasks
 from lerobot_wmrl.data.frame_cache import (
+    FAR,
     cached_context,
     cached_depth,
     cached_features,
@@ -48,6 +49,9 @@ from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model, load
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig, cosine_schedule
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
 from lerobot_wmrl.world_models.text import unreadable
+
+FAR_SHARE: Final = 0.05
+"""Share of the depth that may be beyond `FAR` without a warning."""
 
 HELD_OUT_BATCHES = 8
 """Held-out batches on which a trained world model is measured, which takes a few seconds."""
@@ -196,6 +200,12 @@ def make_clip_sampler(
             longest,
         )  # fmt: skip
     cameras = config.tokenizer.camera_keys
+    depth = cached_depth(dataset, cameras, tokenizer.grid) if config.depth else None
+    if depth is not None and (beyond := float((depth > FAR).mean())) > FAR_SHARE:
+        logging.warning(
+            "%s: %.0f %% of the depth is beyond %.1f m, and is learnt as if it were there",
+            dataset.root, 100 * beyond, FAR,
+        )  # fmt: skip
     return ClipSampler(
         table,
         cached_tokens(dataset, cameras, tokenizer),
@@ -205,7 +215,7 @@ def make_clip_sampler(
         batch_size,
         seed,
         config.device,
-        depth=cached_depth(dataset, cameras, tokenizer.grid) if config.depth else None,
+        depth=depth,
         context=cached_context(dataset, cameras, tokenizer) if config.context_channels else None,
         features=cached_features(dataset, cameras, tokenizer) if config.predicts_success else None,
     )
@@ -219,12 +229,25 @@ def make_joint_sampler(
     with renamed("dataset.root", "dataset.more"):
         for other in more:
             check_dataset(model.config, other.dataset.meta)
+            check_instructions(model, other)
     if isinstance(model.config, ActionWorldModelConfig):
         note_outcomes(model.config, [(table, data.episodes), *((each, None) for each in more)])
     first = make_sampler(model, table, data.episodes, batch_size, seed)
     with renamed("dataset.root", "dataset.more"):
         samplers = [make_sampler(model, each, None, batch_size, seed) for each in more]
     return InTurn(first, samplers) if samplers else first
+
+
+def check_instructions(model: Any, table: EpisodeTable) -> None:
+    """Raise FieldError if a text world model cannot read an instruction of a dataset."""
+    if not isinstance(model.config, TextWorldModelConfig):
+        return
+    try:
+        model.text_encoder.check(table.dataset.meta.tasks.index)
+    except ValueError as error:
+        raise FieldError(
+            "dataset.root", table.dataset.root, str(error), "leave it out, or record other instructions"
+        ) from error
 
 
 def note_outcomes(

@@ -102,6 +102,14 @@ def test_one_wrong_value_does_not_widen_the_range(tmp_path: Path, caplog: pytest
     assert "write the range into meta/info.json" in caplog.text
 
 
+def test_a_range_cannot_be_guessed_without_data(tmp_path: Path) -> None:
+    meta = record(tmp_path / "data", degrees())
+    for file in (tmp_path / "data" / "data").rglob("*.parquet"):
+        file.unlink()
+    with pytest.raises(FieldError, match=r"has no files of data here.*leave out `--dataset\.streaming`"):
+        observed_range(meta)
+
+
 def test_a_rare_action_stays_possible(tmp_path: Path) -> None:
     """A gripper with a noisy sensor that closes in fewer than one of a hundred frames."""
     actions = np.random.default_rng(0).normal(100, 0.2, (2000, 3)).astype(np.float32)

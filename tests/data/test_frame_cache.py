@@ -17,13 +17,15 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data import decoding, frame_cache
 from lerobot_wmrl.data.checks import check_cameras
-from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
+from lerobot_wmrl.data.dataset import ChosenEpisodes, TrainingData, open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import cached_depth, depth_of_windows, token_depth, unmeasured_depth
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.autoregressive.depth import metres
 from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.training import make_joint_sampler
 from tests.trained import action_config, run_training, text_config
 
 CAMERA = "observation.images.third_view"
@@ -165,6 +167,24 @@ def test_a_batch_of_lerobot_train_has_the_depth_of_the_cache(deep_dataset, model
         model.clip_from_batch(batch)
 
 
+def test_depth_beyond_the_farthest_is_named_and_compared_as_it_is_learnt(
+    deep_dataset, models, monkeypatch, caplog
+):
+    model = load_model(models["action_world_model"], "action_world_model")
+    table = read_episodes(deep_dataset)
+    make_joint_sampler(model, table, TrainingData(str(deep_dataset.root)), batch_size=2, seed=0)
+    assert "of the depth is beyond" not in caplog.text
+    depth = np.array(cached_depth(deep_dataset, [CAMERA], model.tokenizer.grid))
+    depth[:, 3] = 4.0
+    for module in ("training", "imagination"):
+        monkeypatch.setattr(f"lerobot_wmrl.world_models.{module}.cached_depth", lambda *_: depth)
+    make_joint_sampler(model, table, TrainingData(str(deep_dataset.root)), batch_size=2, seed=0)
+    assert "6 % of the depth is beyond 2.5 m" in caplog.text
+    recorded = model.recorded_depth(deep_dataset, [0, 7])
+    assert (recorded[:, 3] == 2.5).all()
+    assert (recorded[:, :3] < 1.1).all()
+
+
 def test_replays_measure_depth_on_the_tokens_grid(deep_dataset, models, tmp_path):
     eval_world_model(
         EvalWorldModelConfig(
@@ -224,4 +244,6 @@ def test_a_new_recording_behind_a_link_has_a_cache_of_its_own(linked, small_data
     (tmp_path / "elsewhere" / "back").symlink_to(tmp_path / "elsewhere")
     assert before == frame_cache.file_stamps(dataset)
     os.utime(next((tmp_path / "elsewhere").rglob("*.mp4")), (0, 0))
-    assert before != frame_cache.file_stamps(dataset)
+    assert before != (touched := frame_cache.file_stamps(dataset))
+    dataset.meta.info.fps += 1
+    assert touched != frame_cache.file_stamps(dataset), "frames are found in videos by it"

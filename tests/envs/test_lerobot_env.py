@@ -22,6 +22,7 @@ from lerobot_wmrl.envs.lerobot_env import (
     LeRobotTensorEnv,
     check_frame_rate,
     check_real_env,
+    frame_limit,
     make_tensor_env,
 )
 from lerobot_wmrl.rl.compatibility import check_tasks
@@ -262,7 +263,7 @@ def test_several_tasks_are_shared_out_and_the_longest_episode_counts() -> None:
     env = LeRobotTensorEnv(TwoTasks(episode_length=STEPS), 3, "cpu")
     limits = [each.get_wrapper_attr("_max_episode_steps") for each in env.envs]
     assert limits == [STEPS, 2 * STEPS, STEPS]
-    assert env.max_episode_steps == 2 * STEPS
+    assert env.max_episode_steps == frame_limit(TwoTasks(episode_length=STEPS)) == 2 * STEPS
     check_tasks(TrainConfig(), env)
     with pytest.raises(ValueError, match=r"^algorithm\.type=grpo: .*the environment has 2 tasks; choose one"):
         check_tasks(TrainConfig(algorithm=GRPOConfig()), env)

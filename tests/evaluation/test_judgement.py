@@ -363,6 +363,15 @@ def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
     write(copy / "train_config.json", {"dataset": {"root": config.dataset.root, "episodes": [0, 1]}})
     assert learnt_from(str(copy), LabelledRollouts.read(config.dataset, episodes=[2, 3])) == 0
     assert learnt_from(str(copy), LabelledRollouts.read(config.dataset, episodes=[1, 2])) == 1
+    copy = tmp_path / "of_the_hub"
+    shutil.copytree(model_folder(config.world_model.path), copy)
+    write(copy / "train_config.json", {"dataset": {"repo_id": "user/rollouts"}})
+    assert learnt_from(str(copy), LabelledRollouts.read(again)) == 0, "nothing is downloaded to find out"
+    monkeypatch.setattr("lerobot_wmrl.data.dataset.HF_LEROBOT_HUB_CACHE", tmp_path / "hub")
+    shutil.copytree(
+        small_dataset.root, tmp_path / "hub" / "datasets--user--rollouts" / "snapshots" / "c0ffee"
+    )
+    assert learnt_from(str(copy), LabelledRollouts.read(again)) == 6
     copy = tmp_path / "model"
     shutil.copytree(model_folder(config.world_model.path), copy)
     write(copy / "train_config.json", {"dataset": {"root": "demonstrations", "more": [others.root]}})

@@ -4,16 +4,19 @@ import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs.configs import PushtEnv
 
+from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.play.drive import Drive
+from lerobot_wmrl.play.drive import Drive, RealEpisode
 from lerobot_wmrl.play.drivers import copied
 from lerobot_wmrl.play.visit import Visit
 from lerobot_wmrl.play.world import load_world
@@ -44,6 +47,53 @@ def test_a_real_environment_has_one_task(world):
         FieldError, match=r"^real_env\.task=push,pull: a drive needs a single task; choose one"
     ):
         load_world(world.config, DatasetSource(), None, several)
+
+
+def test_a_policy_that_plans_is_refused(world):
+    with pytest.raises(
+        FieldError, match=r"^policy\.path=None: wm_mpc plans in a world model, as the page does"
+    ):
+        load_world(world.config, DatasetSource(), WmMpcConfig(device="cpu"), None)
+
+
+def test_a_real_environment_gets_actions_beyond_its_space_and_another_state_is_refused(world, monkeypatch):
+    """As Aloha, which takes joint angles and says that they are between −1 and 1."""
+    taken = []
+
+    class Narrow(gym.Env):
+        observation_space = gym.spaces.Dict(
+            {
+                "agent_pos": gym.spaces.Box(-9, 9, (3,), np.float32),
+                "pixels": gym.spaces.Dict({"third_view": gym.spaces.Box(0, 255, (32, 32, 3), np.uint8)}),
+            }
+        )
+        action_space = gym.spaces.Box(-0.01, 0.01, (7,), np.float32)
+        task = task_description = "push"
+        _max_episode_steps = 50
+
+        def look(self):
+            return {
+                "agent_pos": np.zeros(3, np.float32),
+                "pixels": {"third_view": np.zeros((32, 32, 3), np.uint8)},
+            }
+
+        def reset(self, *, seed=None, options=None):
+            return self.look(), {}
+
+        def step(self, action):
+            taken.append(np.array(action))
+            return self.look(), 0.0, False, False, {"is_success": False}
+
+    made = gym.vector.SyncVectorEnv([Narrow])
+    monkeypatch.setattr(PushtEnv, "create_envs", lambda *_, **__: {"narrow": {0: made}})
+    monkeypatch.setattr(world, "real_env", PushtEnv())
+    env = world.make_real_env()
+    far = torch.tensor(world.model.embodiment.action_high)
+    assert (far[:3] > 0.01).all()
+    RealEpisode("narrow", env, 0).step(far[None])
+    np.testing.assert_allclose(taken[0], far)
+    with pytest.raises(FieldError, match=r"^real_env\.type=pusht: has a state of 3 components, .* learnt 8"):
+        world.begin({"seed": 1}, env)
 
 
 def test_going_back_and_doing_the_same_again_gives_the_same_frames(drive):
@@ -212,6 +262,10 @@ def test_a_replacement_that_was_cut_between_its_two_moves_is_put_back(world, sav
     visit.answer({"do": "save", "success": True})
     saved.folder.replace(saved.folder.with_name(".driven.old"))
     assert type(saved)(saved.folder, saved.robot, saved.held).count == 1
+    saved.folder.replace(saved.folder.with_name(".driven.old"))
+    visit.answer({"do": "save", "success": False})
+    table = read_episodes(LeRobotDataset("local/driven", root=saved.folder))
+    assert table.success.tolist() == [True, False], "also by a server that was running meanwhile"
 
 
 def test_two_servers_can_save_into_one_folder(world, saved):

@@ -164,6 +164,18 @@ def test_done_is_left_alone_where_a_dataset_does_not_say_it(small_dataset, train
         assert tuple(bool(joint(step).done_known.any()) for step in (0, 1)) == known
 
 
+def test_further_datasets_have_instructions_that_a_text_world_model_reads(
+    small_dataset, trained_models, make_synthetic_dataset, tmp_path
+):
+    """Else a training would end at its first batch from there, and each time that it is continued."""
+    model = load_model(trained_models["text_world_model"], "text_world_model")
+    table = read_episodes(small_dataset)
+    more = make_synthetic_dataset(tmp_path / "more", instructions=["push", "y" * 600])
+    data = TrainingData(str(small_dataset.root), more=[str(more.root)])
+    with pytest.raises(ValueError, match=rf"^dataset\.more={more.root}: .*600 characters has 601 tokens"):
+        make_joint_sampler(model, table, data, batch_size=2, seed=0)
+
+
 def test_cached_frames_are_those_of_the_dataset(small_dataset):
     frames = cached_frames(small_dataset, ["observation.images.third_view"], 32)
     for index in (0, 7, len(frames) - 1):

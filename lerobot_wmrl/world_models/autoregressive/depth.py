@@ -6,20 +6,17 @@ zero, so the model begins as the one without depth. Nothing flows from the token
 """
 
 from collections.abc import Sequence
-from typing import Final
 
 import torch
 from torch import Tensor, nn
 
 from lerobot_wmrl.data.clips import known_transitions
+from lerobot_wmrl.data.frame_cache import FAR
 from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.autoregressive.network import SpatialTemporalTransformer
 from lerobot_wmrl.world_models.condition import Condition
 from lerobot_wmrl.world_models.layers import FrameEmbedding, FrameHead, FrameSizes, TemporalMemory
 from lerobot_wmrl.world_models.losses import masked_mean
-
-FAR: Final = 2.5
-"""Metres: what is further away counts as that far, as in the recorder's depth maps."""
 
 
 def normalize_depth(depth: Tensor | None, tokens: Tensor) -> Tensor:
