@@ -36,11 +36,6 @@ def make_tensor_env(config: EnvConfig, n_envs: int, device: str) -> TensorEnv:
     if is_own(config):
         env: TensorEnv = config.create_tensor_env(n_envs, device)
         return env
-    if isinstance(config, HubEnvConfig):
-        raise FieldError(
-            "type", config.type, "its code lies on the hub, and this command does not run that of this type",
-            "choose another; lerobot-wmrl-compare takes it, with --trust_remote_code=true",
-        )  # fmt: skip
     return LeRobotTensorEnv(config, n_envs, device)
 
 
@@ -274,7 +269,13 @@ class LeRobotTensorEnv(TensorEnv):
 
 
 def _members(config: EnvConfig, each: int) -> list[list[gym.Env]]:
-    """Make `each` environments of every task. → by task. FieldError if they are not to be had one by one."""
+    """Make `each` environments of every task. → by task. FieldError if they are not to be had one by one, or
+    their code would come from the hub."""
+    if isinstance(config, HubEnvConfig):
+        raise FieldError(
+            "type", config.type, "its code lies on the hub, and this command does not run that of this type",
+            "choose another; lerobot-wmrl-compare takes it, with --trust_remote_code=true",
+        )  # fmt: skip
     made = make_env(config, each, use_async_envs=False)
     tasks = [env for suite in made.values() for env in suite.values()]
     for env in tasks:
