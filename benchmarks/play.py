@@ -144,7 +144,9 @@ async def measure(world: World, maniskill: bool, exported: Path | None, steps: i
     works = {"environment": lambda: alone.env.step(action)}
     if maniskill:
         settings = WmrlManiSkillEnv(
-            task="push", cameras=list(world.sizes.cameras), image_size=world.sizes.image_size
+            task="push",
+            cameras=list(world.tokenizer_config.cameras),
+            image_size=world.tokenizer_config.image_size,
         )
         simulator = settings.create_tensor_env(1, "cpu")
         simulator.reset(seed=[0])
@@ -204,8 +206,8 @@ def main() -> None:
     world = load_world(env, DatasetSource(given.root), None, None)
     figures = {
         "threads": torch.get_num_threads(),
-        "image_size": world.sizes.image_size,
-        "cameras": len(world.sizes.cameras),
+        "image_size": world.tokenizer_config.image_size,
+        "cameras": len(world.tokenizer_config.cameras),
         **asyncio.run(measure(world, given.maniskill, given.exported, given.steps)),
     }
     print(json.dumps(figures, indent=2))

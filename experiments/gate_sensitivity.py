@@ -66,8 +66,8 @@ def measure(repeats: np.ndarray, success: np.ndarray, errors_mm: Sequence[float]
     return [
         {
             "error_mm": error,
-            "false_positive_rate": Proportion(int(calls[~success].sum()), int((~success).sum())).as_json(),
-            "recall": Proportion(int(calls[success].sum()), int(success.sum())).as_json(),
+            "false_positive_rate": Proportion.of(calls[~success]).as_json(),
+            "recall": Proportion.of(calls[success]).as_json(),
         }
         for error, calls in zip(errors_mm, repeats.T, strict=True)
     ]

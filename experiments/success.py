@@ -34,7 +34,7 @@ def outcomes(folder: Path) -> Outcomes:
 
 def rate(found: Sequence[bool]) -> dict[str, Any]:
     """Return successes, episodes, share, Wilson's interval, and the outcomes themselves."""
-    return {**Proportion(sum(found), len(found)).as_json(), "outcomes": [int(success) for success in found]}
+    return {**Proportion.of(found).as_json(), "outcomes": [int(success) for success in found]}
 
 
 @dataclass(frozen=True)

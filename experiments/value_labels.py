@@ -57,7 +57,7 @@ NEGATIVE: Final = " (advantage: negative)"
 def read_labelled(root: Path) -> EpisodeTable:
     """Read the episodes of a dataset that tells successes from failures. FieldError if it does not."""
     table = read_episodes(open_dataset(root))
-    if not table.done_known:
+    if not table.has_labels:
         raise FieldError("root", root, "has no column next.success", "add it, for failures too")
     if len(outcomes := set(table.success.tolist())) < 2:
         outcome = "succeeds" if outcomes == {True} else "fails"

@@ -38,7 +38,7 @@ def recorded(tmp_path_factory) -> Path:
 def test_the_scripted_pusher_records_what_a_world_model_can_learn_from(recorded):
     table = read_episodes(open_dataset(recorded))
     assert len(table.length) == 2
-    assert table.done_known
+    assert table.has_labels
     assert table.success.any()
     assert table.action.shape[1] == table.state.shape[1] == 2
     assert np.linalg.norm(np.diff(table.action, axis=0), axis=1).mean() > 1

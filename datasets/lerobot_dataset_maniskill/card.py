@@ -100,7 +100,7 @@ def success_rows(table: EpisodeTable) -> Iterator[tuple[Any, ...]]:
     tasks, kinds, success = table.columns[START_TASK], table.columns[START_KIND], table.success
     for task, kind in sorted({*zip(tasks.tolist(), kinds.tolist(), strict=True)}):
         chosen = success[(tasks == task) & (kinds == kind)]
-        rate = Proportion(int(chosen.sum()), len(chosen))
+        rate = Proportion.of(chosen)
         low, high = rate.interval
         shown = f"{rate.share:.0%} ({low:.0%}–{high:.0%})"
         yield TASK_NAMES[task], KINDS[kind], rate.n, rate.k, shown

@@ -29,6 +29,11 @@ class Proportion:
     n: int
 
     @classmethod
+    def of(cls, outcomes: Sequence[bool] | np.ndarray) -> "Proportion":
+        """Count the successes among outcomes. (n,)"""
+        return cls(int(np.sum(outcomes)), len(outcomes))
+
+    @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "Proportion":
         """Return the proportion that `as_json` has written."""
         return cls(content["k"], content["n"])

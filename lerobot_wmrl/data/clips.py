@@ -127,7 +127,7 @@ class ClipSampler:
             rows, self.table.length[episodes][:, None] - 1
         )
         shows_start = self.context is not None
-        known = valid & self.table.done_known & (shows_start | (offsets == 0))[:, None]
+        known = valid & self.table.has_labels & (shows_start | (offsets == 0))[:, None]
         context = NO_CONTEXT if self.context is None else Context((self._tensor(self.context[episodes]),))
         return Clip(
             tokens=self._tensor(self.tokens[rows]).long(),

@@ -94,7 +94,7 @@ class EpisodeTable:
         return any(shown[rows].any() for rows in self.rows(episodes))
 
     @property
-    def done_known(self) -> bool:
+    def has_labels(self) -> bool:
         """Whether the dataset says where success holds; else done is False everywhere."""
         return success_column(self.dataset.features) is not None
 

@@ -111,8 +111,9 @@ def check_real_env(policy: PreTrainedConfig, config: EnvConfig, starts: int = 0)
 def frame_limit(config: EnvConfig) -> int:
     """Return the most frames of an episode of `real_env`, of which one a task is made to ask it: LeRobot's
     rollouts go by the environment, and some configurations say something else (Meta-World's)."""
-    if isinstance(config, WmrlManiSkillEnv):
-        return config.horizon
+    if is_own(config):
+        own: Any = config
+        return int(own.horizon)
     with within("real_env"):
         envs = [env for members in _members(config, 1) for env in members]
         limits = [_frame_limit(config, env) for env in envs]

@@ -58,7 +58,7 @@ class SceneResults:
 
     def _rate(self, indices: set[int]) -> Proportion:
         outcomes = [success for scene, success in self.episodes.values() if scene.index in indices]
-        return Proportion(sum(outcomes), len(outcomes))
+        return Proportion.of(outcomes)
 
 
 def _name(scene: Scene) -> str:

@@ -165,24 +165,24 @@ def branch_frames(table: EpisodeTable, episodes: np.ndarray, branches: int) -> n
 
 def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> StartImages:
     """Read frames of a LeRobotDataset's episodes: the first ones, and those of the branches."""
-    sizes = config.trained_tokenizer
+    tokenizer_config = config.trained_tokenizer
     table = read_episodes(source.open())
     check_dataset(config, table.dataset.meta)
-    if source.branches and not sizes.context:
+    if source.branches and not tokenizer_config.context:
         raise FieldError(
             "dataset.branches", source.branches,
             "the world model is not shown how an episode began, so it cannot tell success from its middle on",
             "train its tokenizer with `model.tokenizer.context=true`, or leave `branches` out",
         )  # fmt: skip
     return recorded_frames(
-        table, branch_frames(table, chosen_episodes(table, source), source.branches), sizes
+        table, branch_frames(table, chosen_episodes(table, source), source.branches), tokenizer_config
     )
 
 
-def recorded_frames(table: EpisodeTable, rows: np.ndarray, sizes: TokenizerConfig) -> StartImages:
-    """Read these rows (K,) of a dataset as a tokenizer of these sizes sees them."""
+def recorded_frames(table: EpisodeTable, rows: np.ndarray, tokenizer_config: TokenizerConfig) -> StartImages:
+    """Read these rows (K,) of a dataset as this tokenizer sees them."""
     episodes = np.searchsorted(table.start, rows, side="right") - 1
-    images = cached_frames(table.dataset, sizes.camera_keys, sizes.image_size)
+    images = cached_frames(table.dataset, tokenizer_config.camera_keys, tokenizer_config.image_size)
 
     def depth(model: WorldModelRewardModel) -> Tensor | None:
         check_dataset(model.config, table.dataset.meta)
@@ -198,14 +198,14 @@ def recorded_frames(table: EpisodeTable, rows: np.ndarray, sizes: TokenizerConfi
     )
 
 
-def observed_frame(observation: Mapping[str, Any], sizes: TokenizerConfig) -> StartImages:
+def observed_frame(observation: Mapping[str, Any], tokenizer_config: TokenizerConfig) -> StartImages:
     """Take what an environment shows, in LeRobot's names and batches of one, as the start of an episode.
 
     Raises:
         ValueError: it lacks a camera of the tokenizer.
     """
     tensors = {name: value.cpu() for name, value in observation.items() if isinstance(value, Tensor)}
-    images = to_pixels(stack_cameras(tensors, sizes.camera_keys, sizes.image_size))
+    images = to_pixels(stack_cameras(tensors, tokenizer_config.camera_keys, tokenizer_config.image_size))
     state = tensors.get(OBS_STATE, torch.zeros(len(images), 0)).float().numpy()
     unknown = np.full(len(images), -1)
     return StartImages(images, images, state, list(observation["task"]), unknown, without_depth)
@@ -271,12 +271,12 @@ def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> Star
     Raises:
         FieldError: the dataset's frames, which they have to be like, are no squares of one size.
     """
-    tasks, sizes = source.tasks or TASK_NAMES[:1], config.trained_tokenizer
+    tasks, tokenizer_config = source.tasks or TASK_NAMES[:1], config.trained_tokenizer
     remedy = "start in the dataset's episodes (`dataset.root`)"
-    side = maniskill_side(sizes, "dataset.resets", source.resets, remedy)
+    side = maniskill_side(tokenizer_config, "dataset.resets", source.resets, remedy)
     env = WmrlManiSkillEnv(
         task=tasks[0], split="ood" if source.split == "ood" else "ind", scenes=source.scenes,
-        cameras=list(sizes.cameras), image_size=side,
+        cameras=list(tokenizer_config.cameras), image_size=side,
     )  # fmt: skip
     with within("dataset"):
         scenes = env.selected_scenes()
@@ -288,25 +288,25 @@ def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> Star
         instructions.append(simulation.instruction)
         indices.append(simulation.task.index)
     simulation.close()
-    views = ([frame.images[camera] for frame in frames] for camera in sizes.cameras)
-    images = np.stack([_squares(np.stack(view), sizes.image_size) for view in views], 1)
+    views = ([frame.images[camera] for frame in frames] for camera in tokenizer_config.cameras)
+    images = np.stack([_squares(np.stack(view), tokenizer_config.image_size) for view in views], 1)
     state = np.stack([frame.state for frame in frames])
     return StartImages(images, images, state, instructions, np.array(indices), without_depth)
 
 
-def maniskill_side(sizes: TokenizerConfig, field: str, value: object, remedy: str) -> int:
+def maniskill_side(tokenizer_config: TokenizerConfig, field: str, value: object, remedy: str) -> int:
     """Return the side of the frames that ManiSkill renders, that of the dataset's.
 
     Raises:
         FieldError: about this field and value, with this remedy; the dataset's are no squares of one size.
     """
-    if sizes.square_side is None:
+    if tokenizer_config.square_side is None:
         raise FieldError(
             field, value,
             "ManiSkill's frames are squares of one size, those that the world model has learnt from are not",
             remedy,
         )  # fmt: skip
-    return sizes.square_side
+    return tokenizer_config.square_side
 
 
 def without_depth(model: WorldModelRewardModel) -> None:

@@ -265,6 +265,6 @@ def robustness(
         predicted = first_run((imagined.done_probability >= threshold).cpu().numpy(), frames) >= 0
         pair = starts.tokens, imagined.tokens[:, -1]
         first, last = (model.tokenizer.decode(tokens, starts.context) for tokens in pair)
-        result.predicted_success[name] = Proportion(int(predicted.sum()), len(predicted))
+        result.predicted_success[name] = Proportion.of(predicted)
         result.psnr_to_start[name] = Estimate.mean(psnr(last, first).cpu().numpy())
     return result

@@ -39,7 +39,7 @@ class Agreement:
         """Count successes from the outcomes of each policy's episodes in both environments."""
 
         def share(successes: Sequence[bool]) -> Proportion:
-            return Proportion(sum(successes), len(successes))
+            return Proportion.of(successes)
 
         return cls({name: (share(imagined), share(real)) for name, (imagined, real) in outcomes.items()})
 

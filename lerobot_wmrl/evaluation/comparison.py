@@ -95,7 +95,7 @@ class Comparison:
 
     def rates(self) -> dict[str, Proportion]:
         """Return each policy's success rate."""
-        return {name: Proportion(sum(outcomes), len(outcomes)) for name, outcomes in self._outcomes().items()}
+        return {name: Proportion.of(outcomes) for name, outcomes in self._outcomes().items()}
 
     def rates_by_task(self) -> dict[str, dict[str, Proportion]]:
         """Return the rates of each task, named by its suite and its number there."""

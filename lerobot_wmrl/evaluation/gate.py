@@ -96,8 +96,8 @@ def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:
     return Gate(
         threshold=threshold,
         frames=frames,
-        false_positives=Proportion(int((predicted & ~success).sum()), int((~success).sum())),
-        recall=Proportion(int((predicted & success).sum()), int(success.sum())),
+        false_positives=Proportion.of(predicted[~success]),
+        recall=Proportion.of(predicted[success]),
         cut_short=int(outcomes.cut_short(frames).sum()),
         repeats_last=outcomes.ends_at_success(frames),
         auc=outcomes.auc(frames),

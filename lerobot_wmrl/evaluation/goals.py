@@ -116,7 +116,7 @@ class GoalQuality(NamedTuple):
 def goal_quality(goals: Goals, probe: TrainedProbe | None) -> GoalQuality:
     """Measure the distances of goals and starts to the nearest finals, and the probe's share of successes."""
     quality = GoalQuality(
-        Proportion(int(goals.reached.sum()), len(goals.reached)), Estimate.mean(goals.distance),
+        Proportion.of(goals.reached), Estimate.mean(goals.distance),
         Estimate.mean(goals.start_distance), Estimate.mean(nearest_psnr(goals)),
     )  # fmt: skip
     if probe is None or goals.finals is None:

@@ -48,7 +48,7 @@ class Judgement:
 
     def imagined(self, name: str) -> Proportion:
         """Return how often a policy succeeds in the world model."""
-        return Proportion(sum(self.outcomes[name]), len(self.outcomes[name]))
+        return Proportion.of(self.outcomes[name])
 
     def corrected(self, name: str) -> RateEstimate:
         """Return that rate, corrected for false positives and recall; it may lie beyond 0 and 1."""

@@ -181,7 +181,7 @@ def labelled_recording(model: ActionWorldModelRewardModel, table: EpisodeTable) 
         FieldError: the dataset does not fit the model, or has no labels of success.
     """
     check_dataset(model.config, table.dataset.meta)
-    if not table.done_known:
+    if not table.has_labels:
         raise FieldError(
             "dataset.root", table.dataset.root,
             "has neither next.success nor next.done, which say whether success holds",
@@ -220,7 +220,7 @@ def seen_outcomes(
         Their outcomes as the gate has them; None for a model without such a classifier, or without labels.
     """
     done, table = model.dynamics.network.done, recording.table
-    if not isinstance(done, PredictedSuccess) or not table.done_known:
+    if not isinstance(done, PredictedSuccess) or not table.has_labels:
         return None
     features = cached_features(table.dataset, model.config.tokenizer.camera_keys, model.tokenizer)
 

@@ -67,13 +67,13 @@ def reconstruction_metrics(
     colors = measured.moving_colors.sum(0)
     whole = psnr_from_mse(measured.error).mean(0)
     moving = psnr_from_mse(measured.moving_error.sum(0) / colors)
-    sizes = model.config.tokenizer
-    cameras = list(enumerate(sizes.cameras))
+    tokenizer_config = model.config.tokenizer
+    cameras = list(enumerate(tokenizer_config.cameras))
     return {
         "frames": len(rows),
         "psnr": {camera: round(whole[i].item(), 3) for i, camera in cameras},
         "moving_psnr": {camera: round(moving[i].item(), 3) if colors[i] else None for i, camera in cameras},
-        **code_use(make_codebook(sizes.quantizer, sizes.levels), measured.tokens),
+        **code_use(make_codebook(tokenizer_config.quantizer, tokenizer_config.levels), measured.tokens),
     }
 
 
@@ -101,10 +101,10 @@ def code_use(codebook: CodeBook, tokens: Tensor) -> dict[str, Any]:
     A large code book is not filled by a few thousand frames; its factors are more telling.
     """
     factors = codebook.codes(tokens.flatten()).unbind(-1)
-    sizes = codebook.level_counts
+    level_counts = codebook.level_counts
     return {
-        "codes": _use(tokens.flatten(), int(np.prod(sizes))),
-        "code_factors": [_use(codes, size) for codes, size in zip(factors, sizes, strict=True)],
+        "codes": _use(tokens.flatten(), int(np.prod(level_counts))),
+        "code_factors": [_use(codes, size) for codes, size in zip(factors, level_counts, strict=True)],
     }
 
 
@@ -120,8 +120,8 @@ def write_reconstruction(model: TokenizingModel, table: EpisodeTable, output_dir
         return known
     split = "validation" if table.validation.any() else "all"
     episodes = choose_episodes(table, split, MAX_FRAMES)
-    sizes = model.config.tokenizer
-    frames = cached_frames(table.dataset, sizes.camera_keys, sizes.image_size)
+    tokenizer_config = model.config.tokenizer
+    frames = cached_frames(table.dataset, tokenizer_config.camera_keys, tokenizer_config.image_size)
     measured = {"split": split, **reconstruction_metrics(model.eval(), table, frames, episodes)}
     write_json(path, measured)
     return measured

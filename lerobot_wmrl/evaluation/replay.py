@@ -37,8 +37,10 @@ class Recording:
     @classmethod
     def read(cls, table: EpisodeTable, model: Any) -> "Recording":
         """Read the frames of the cameras that a world model looks at, at its size."""
-        sizes = model.config.tokenizer
-        return cls(table, cached_frames(table.dataset, sizes.camera_keys, sizes.image_size))
+        tokenizer_config = model.config.tokenizer
+        return cls(
+            table, cached_frames(table.dataset, tokenizer_config.camera_keys, tokenizer_config.image_size)
+        )
 
     def rows(self, episode: int) -> slice:
         """Return the rows of an episode."""

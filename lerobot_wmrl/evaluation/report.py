@@ -146,7 +146,7 @@ def evaluate(
             shown.setdefault("success" if run.done.any() else "failure", run)
     accuracy.sort(key=lambda each: each.episode)
     outcomes = Outcomes.stack(replays).attempts(recording.table).within(episode_length)
-    known = outcomes.where(np.full(len(outcomes.episodes), recording.table.done_known))
+    known = outcomes.where(np.full(len(outcomes.episodes), recording.table.has_labels))
     return ReplayEvaluation(accuracy, outcomes.episodes, known, shown)
 
 

@@ -61,8 +61,7 @@ class TrainedProbe:
     @torch.no_grad()
     def success(self, first: Tensor, images: Tensor) -> Proportion:
         """Return the share of decoded frames (F, N, 3, H, W) in which success holds."""
-        holds = self.network(first, images) > 0
-        return Proportion(int(holds.sum()), len(holds))
+        return Proportion.of((self.network(first, images) > 0).cpu().numpy())
 
     def as_json(self) -> dict[str, Any]:
         known = np.isfinite(self.balanced_accuracy)

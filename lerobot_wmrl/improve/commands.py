@@ -211,7 +211,7 @@ def compare(
     imagined = env["env.type"] == "world_model"
     if imagined:  # none twice: there are at least as many as episodes
         starts = min(starts, progress.learnt.fewest_starts())
-        env = {**env, "env.dataset.max_starts": progress.learnt.spread(starts)}
+        env = {**env, "env.dataset.max_starts": progress.learnt.evenly_chosen(starts)}
     at_once = 16 if imagined else MANISKILL_PROCESSES if progress.plan.in_maniskill else 1
     return ["lerobot-wmrl-compare", *format_flags({
         "policies": [*(policies or progress.policies.values())], "against": "all", **env,

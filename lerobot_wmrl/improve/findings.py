@@ -118,7 +118,7 @@ def require_improvable(
         )  # fmt: skip
     check_fit(policy, shown, table.action.shape[1], "the dataset")
     if not table.success.any():
-        has = "has no successful episode" if table.done_known else "says nowhere whether an episode succeeds"
+        has = "has no successful episode" if table.has_labels else "says nowhere whether an episode succeeds"
         raise FieldError(
             "dataset.root", table.dataset.root, f"{has}, so there is nothing to reward",
             "add next.success with lerobot-wmrl-label, or record successes",

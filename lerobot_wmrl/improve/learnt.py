@@ -55,7 +55,7 @@ class LearntEpisodes:
         begun = chosen_episodes(table, StartFrames(max_starts=MAX_STARTS, branches=branches))
         return int(np.unique(table.column(START_TASK)[begun], return_counts=True)[1].min())
 
-    def spread(self, starts: int) -> int:
+    def evenly_chosen(self, starts: int) -> int:
         """Return how many starts imagination takes in a comparison on `starts` of them: those of as many
         episodes, spread evenly over the dataset. Of several tasks it takes all, because some may have few."""
         tasks = self.plan.findings.tasks

@@ -125,8 +125,8 @@ def describe(world: World, table: EpisodeTable, rows: np.ndarray) -> dict[str, A
         **served,
         "drivers": ["recorded"], "policy": "", "real": "", "goal": False, "compares": False,
         "first_frames": True, "saves": False,
-        "side": world.sizes.image_size,
-        "sizes": [[width, height] for _, height, width in world.sizes.frame_shapes.values()],
+        "side": world.tokenizer_config.image_size,
+        "sizes": [[width, height] for _, height, width in world.tokenizer_config.frame_shapes.values()],
         "window": world.model.clip_length,
         "done_frames": world.config.done_frames,
         "episode_length": world.config.horizon,
@@ -143,9 +143,11 @@ def recorded(world: World, table: EpisodeTable, row: int) -> Mapping[str, Any]:
 
 def write_frames(world: World, table: EpisodeTable, rows: np.ndarray, folder: Path) -> None:
     """Write the first frames of these episodes as the tokenizer sees them, numbered anew."""
-    images = cached_frames(table.dataset, world.sizes.camera_keys, world.sizes.image_size)
+    images = cached_frames(
+        table.dataset, world.tokenizer_config.camera_keys, world.tokenizer_config.image_size
+    )
     for index, row in enumerate(rows.tolist()):
-        for camera, image in zip(world.sizes.cameras, images[int(table.start[row])], strict=True):
+        for camera, image in zip(world.tokenizer_config.cameras, images[int(table.start[row])], strict=True):
             Image.fromarray(image).save(folder / f"{index}_{camera}.png")
 
 

@@ -223,9 +223,11 @@ def export_graphs(model: ActionWorldModelRewardModel, folder: Path) -> None:
             f"has {kind} dynamics; only anchored ones can be exported",
             "train one with --model.dynamics.type=anchored, or serve the page instead",
         )  # fmt: skip
-    sizes = model.config.tokenizer
+    tokenizer_config = model.config.tokenizer
     tensors: Tensors = {
-        "pictures": torch.rand(1, len(sizes.cameras), 3, sizes.image_size, sizes.image_size),
+        "pictures": torch.rand(
+            1, len(tokenizer_config.cameras), 3, tokenizer_config.image_size, tokenizer_config.image_size
+        ),
         "measured_state": model.state_mean[None].clone(),
         "action": model.action_mean[None].clone(),
         "age": torch.zeros(1, dtype=torch.long),

@@ -130,7 +130,7 @@ class PlayServer:
         try:
             form = await request.post()
             files = [(name, part.file) for name, part in form.items() if isinstance(part, web.FileField)]
-            cameras = self.world.sizes.cameras
+            cameras = self.world.tokenizer_config.cameras
             if (names := sorted(name for name, _ in files)) != sorted(cameras):
                 raise FieldError(
                     "picture", names, f"the world model sees the cameras {', '.join(cameras)}",

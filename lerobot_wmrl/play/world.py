@@ -70,8 +70,8 @@ class World:
         return config
 
     @property
-    def sizes(self) -> TokenizerConfig:
-        """Cameras of the world model and sizes of their images."""
+    def tokenizer_config(self) -> TokenizerConfig:
+        """Settings of the tokenizer: cameras, and sizes of their images."""
         return self.model.trained_tokenizer
 
     def description(self) -> dict[str, Any]:
@@ -81,11 +81,11 @@ class World:
         if table is not None:
             rows = zip(table.length.tolist(), table.success.tolist(), table.instructions, strict=True)
             episodes = [
-                {"length": length, "success": success if table.done_known else None, "task": task}
+                {"length": length, "success": success if table.has_labels else None, "task": task}
                 for length, success, task in rows
             ]
         return {
-            "cameras": list(self.sizes.cameras),
+            "cameras": list(self.tokenizer_config.cameras),
             "fps": self.model.embodiment.fps,
             "axes": self.axes(),
             "state": self.model.embodiment.state_names if self.model.state_size else [],
@@ -174,7 +174,7 @@ class World:
                 )
             seed = whole_number("seed", place["seed"], LARGEST_SEED)
             real = RealEpisode(self.real_env.type, real_env, seed)
-            start = observed_frame(real.observation, self.sizes)
+            start = observed_frame(real.observation, self.tokenizer_config)
             if self.model.state_size not in (0, count := start.state.shape[1]):
                 raise FieldError(
                     "real_env.type", self.real_env.type,
@@ -199,7 +199,7 @@ class World:
         Raises:
             FieldError: a camera is missing or unknown, or the state has another length.
         """
-        sizes, count = self.sizes, self.model.state_size
+        tokenizer_config, count = self.tokenizer_config, self.model.state_size
         values = [] if state is None else state
         if not is_numbers(values) or len(values) != count:
             raise FieldError(
@@ -208,15 +208,15 @@ class World:
                 f"must be {count} finite numbers: {', '.join(self.model.embodiment.state_names)}",
             )
         try:
-            pictures = [images[camera] for camera in sizes.cameras]
+            pictures = [images[camera] for camera in tokenizer_config.cameras]
             shown = {
                 key: pil_to_tensor(ImageOps.exif_transpose(picture).convert("RGB"))[None]
-                for key, picture in zip(sizes.camera_keys, pictures, strict=True)
+                for key, picture in zip(tokenizer_config.camera_keys, pictures, strict=True)
             }
         except OSError as error:
             raise FieldError("picture", sorted(images), f"cannot be decoded ({error})") from error
         shown[OBS_STATE] = torch.tensor([values], dtype=torch.float32).reshape(1, count)
-        self.uploads[name] = observed_frame({**shown, "task": [task]}, sizes)
+        self.uploads[name] = observed_frame({**shown, "task": [task]}, tokenizer_config)
 
     def _recorded(self, place: Mapping[str, Any]) -> tuple[StartImages, Recorded]:
         """Return a frame of the dataset, and what followed it."""
@@ -226,9 +226,13 @@ class World:
         frame = whole_number("frame", place.get("frame"), int(self.table.length[episode]) - 1)
         begin = int(self.table.start[episode])
         first, end = begin + frame, begin + int(self.table.length[episode])
-        images = cached_frames(self.table.dataset, self.sizes.camera_keys, self.sizes.image_size)[first:end]
+        images = cached_frames(
+            self.table.dataset, self.tokenizer_config.camera_keys, self.tokenizer_config.image_size
+        )[first:end]
         actions = self.table.action[first:end].astype(np.float32)
-        return recorded_frames(self.table, np.array([first]), self.sizes), Recorded(actions, images)
+        return recorded_frames(self.table, np.array([first]), self.tokenizer_config), Recorded(
+            actions, images
+        )
 
     def _uploaded(self, place: Mapping[str, Any]) -> StartImages:
         name = place.get("picture")
@@ -260,8 +264,8 @@ def load_world(
         if len(real_env.task_names) > 1:
             raise FieldError("real_env.task", real_env.task, "a drive needs a single task", "choose one")
         remedy = "choose the environment that the dataset was recorded in"
-        side = maniskill_side(world.sizes, "real_env.type", real_env.type, remedy)
-        real_env = replace(real_env, cameras=list(world.sizes.cameras), image_size=side)
+        side = maniskill_side(world.tokenizer_config, "real_env.type", real_env.type, remedy)
+        real_env = replace(real_env, cameras=list(world.tokenizer_config.cameras), image_size=side)
     world.real_env = real_env
     if dataset.given:
         world.table = read_episodes(dataset.open())

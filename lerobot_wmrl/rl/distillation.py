@@ -35,7 +35,7 @@ from lerobot_wmrl.world_models.planning import Planner
 
 LABELS_FOLDER = "labels"
 
-LEAST_SPREAD = 0.05
+LEAST_STD_SHARE = 0.05
 """A component of actions is learnt if one normalised unit of the policy is at least this share of the
 component's standard deviation in the world model's data. Otherwise it hardly varied where the policy was
 trained, and its errors would outweigh all others in the loss."""
@@ -201,11 +201,11 @@ class Distillation(RLAlgorithm):
         )  # fmt: skip
 
     def learnt_components(self, env: WorldModelVectorEnv, pipeline: Pipeline) -> Tensor:
-        """Return which components of actions the policy's normalisation lets it learn (LEAST_SPREAD). (A,)"""
-        spread = env.model.action_spread()
+        """Return which components of actions the policy can learn, see `LEAST_STD_SHARE`. (A,)"""
+        deviation = env.model.action_deviation()
         if pipeline.action_unit is None:
-            return torch.ones_like(spread, dtype=torch.bool)
-        return pipeline.action_unit.to(env.device) >= LEAST_SPREAD * spread
+            return torch.ones_like(deviation, dtype=torch.bool)
+        return pipeline.action_unit.to(env.device) >= LEAST_STD_SHARE * deviation
 
     def check_recorded(self, env: WorldModelVectorEnv, pipeline: Pipeline) -> None:
         """Raise FieldError if recorded episodes are learnt from, and do not fit into memory or vary in what

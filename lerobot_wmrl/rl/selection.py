@@ -47,9 +47,7 @@ class Selection:
     def run(self, iteration: int, checkpoint: Path, folder: Path) -> Record:
         """Return the proportion of successes, `real` and `imagined`."""
         results = {place: measure() for place, measure in self.measures.items()}
-        shares = {
-            place: Proportion(sum(each.successes), len(each.successes)) for place, each in results.items()
-        }
+        shares = {place: Proportion.of(each.successes) for place, each in results.items()}
         summary = ", ".join(f"{place} success {share}" for place, share in shares.items())
         logging.info("Iteration %d: %s", iteration, summary)
         steps = results[REAL].steps if REAL in results else 0

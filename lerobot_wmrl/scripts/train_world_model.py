@@ -245,7 +245,7 @@ def quality(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> str:
         "held-out episodes" if measured else "the last training batch (none of these episodes is held out)"
     )
     measured = measured or read_metrics(cfg.output_dir)[-1]
-    done = ("done_loss",) if table.done_known else ()
+    done = ("done_loss",) if table.has_labels else ()
     shown = ("loss", "token_accuracy", "moving_token_accuracy", *done, "state_loss")
     values = ", ".join(f"{name.replace('_', ' ')} {measured[name]:.3f}" for name in shown if name in measured)
     return f"On {where}: {values}."

@@ -179,11 +179,11 @@ def check_dataset(config: FrameTokenizerConfig | WorldModelConfig, meta: Any) ->
     meta: the dataset's metadata, a LeRobotDatasetMetadata.
     """
     features = meta.features
-    sizes = config.trained_tokenizer if isinstance(config, WorldModelConfig) else config.tokenizer
-    check_cameras(features, sizes.camera_keys)
+    tokenizer_config = config.trained_tokenizer if isinstance(config, WorldModelConfig) else config.tokenizer
+    check_cameras(features, tokenizer_config.camera_keys)
     if isinstance(config, WorldModelConfig):
         if config.depth:
-            check_depth(features, sizes.camera_keys)
+            check_depth(features, tokenizer_config.camera_keys)
         check_widths(features, {OBS_STATE: config.state_size})
     if isinstance(config, ActionWorldModelConfig):
         check_widths(features, {ACTION: config.action_size})

@@ -70,7 +70,7 @@ class Imagination:
         self.cache.restart(mask)
 
 
-def spread_rows(frames: int, sequences: int, device: torch.device) -> Tensor:
+def repeated_rows(frames: int, sequences: int, device: torch.device) -> Tensor:
     """Return the frame of each action sequence, 0, …, 0, 1, …, for as many a frame. → (sequences,)"""
     return torch.arange(frames, device=device).repeat_interleave(sequences // frames)
 
@@ -147,7 +147,7 @@ class Dynamics(nn.Module):
             with_tokens: whether the tokens of the last frame are needed.
         """
         used = replace(frames, context=Context(frames.context.maps[:1]))  # the others are the tokenizer's
-        imagination = self.start(used[spread_rows(len(frames), len(actions), actions.device)])
+        imagination = self.start(used[repeated_rows(len(frames), len(actions), actions.device)])
         steps = [self.step(imagination, encode(action[:, None])) for action in actions.unbind(1)]
         return OpenLoopPrediction(
             torch.stack([step.done_logit for step in steps], 1),

@@ -19,7 +19,7 @@ from lerobot_wmrl.world_models.dynamics import (
     Imagination,
     Imagined,
     OpenLoopPrediction,
-    spread_rows,
+    repeated_rows,
 )
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
 
@@ -135,7 +135,7 @@ class ImaginationMixin:
         self._require_instruction_weights(frames)
         weights = frames.instruction_weights
         if weights is not None:
-            weights = weights[spread_rows(len(frames), len(actions), actions.device)]
+            weights = weights[repeated_rows(len(frames), len(actions), actions.device)]
         encode = partial(self.encode_actions, instruction_weights=weights)
         prediction = self.dynamics.open_loop(self._normalized(frames), actions, encode, with_tokens)
         return prediction._replace(state=self.denormalize_state(prediction.state))

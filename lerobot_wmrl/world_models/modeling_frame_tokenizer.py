@@ -134,8 +134,8 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
             )
 
     def _observed(self, batch: dict[str, Tensor]) -> Tensor:
-        sizes = self.config.tokenizer
-        return stack_cameras(batch, sizes.camera_keys, sizes.image_size)
+        tokenizer_config = self.config.tokenizer
+        return stack_cameras(batch, tokenizer_config.camera_keys, tokenizer_config.image_size)
 
     def _stack(self, batch: dict[str, Tensor], prefix: str) -> Tensor:
         keys = [f"{prefix}.{camera}" for camera in self.config.tokenizer.cameras]

@@ -46,29 +46,11 @@ from lerobot_wmrl.world_models.modeling_frame_tokenizer import (
     stretch_cameras,
     with_frame_sizes,
 )
+from lerobot_wmrl.world_models.scaling import REACH, STATE_MIN_STD, Scale
 from lerobot_wmrl.world_models.text import CHECKPOINT_FOLDER, FrozenT5, check_one_each, make_text_encoder
 
 CONDITION_TOKENS: Final = 4
 """Tokens that an action is embedded into."""
-
-MIN_SPREAD: Final = 1e-3
-"""Standard deviation below which a component is a constant, and not scaled: in the dataset's units, for small
-actions in halves of their component's range."""
-
-ROUNDING: Final = 1e-6
-"""Standard deviation that rounding may give a constant component, as a share of its mean, or of 1."""
-
-STATE_SPREAD: Final = 0.02
-"""Least standard deviation by which the state is scaled, in the dataset's units. The opening of a closed
-gripper or the rotation of a hand held upright hardly varies: scaled by less, its noise would weigh as much as
-centimetres."""
-
-STATE_LIMIT: Final = 5.0
-"""Standard deviations to which the normalised state is clamped, or as far as the data goes beyond: a gripper
-that is seldom open, a pose that episodes begin with."""
-
-FARTHEST_STATE: Final = 50.0
-"""Standard deviations beyond which a recorded state is taken for an error of measurement."""
 
 UNLABELLED_DONE: Final = -5.0
 """Initial logit of done where the dataset does not say what success is. Nothing trains done then, and at a
@@ -117,8 +99,8 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         self._unmeasured: list[float] = []  # known with the dataset
         if dataset_meta is not None:
             self._adopt_dataset(dataset_meta)
-        sizes: Any = config.tokenizer  # given, or adopted above
-        self.tokenizer = FrameTokenizer(sizes).requires_grad_(False)
+        tokenizer_config: Any = config.tokenizer  # given, or adopted above
+        self.tokenizer = FrameTokenizer(tokenizer_config).requires_grad_(False)
         if source is not None:
             self.tokenizer.load_state_dict(source.tokenizer.state_dict())
         self.tokenizer.eval()
@@ -129,25 +111,14 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
             done.head.load_state_dict(self.tokenizer.success.head.state_dict())  # type: ignore[union-attr]
         elif dataset_meta is not None and success_column(dataset_meta.features) is None:
             nn.init.constant_(done[-1].bias, UNLABELLED_DONE)
-        self._register_statistics("state", OBS_STATE, config.state_size, dataset_stats, STATE_SPREAD)
-        self.register_buffer("state_limit", self._state_limit(dataset_stats))
-
-    def _state_limit(self, stats: Any) -> Tensor:
-        """Return the standard deviations to which each component of the state is clamped. (P,)"""
-        if stats is None or not self.config.state_size or "max" not in stats[OBS_STATE]:
-            return torch.full_like(self.state_std, STATE_LIMIT)
-        ends = [torch.as_tensor(stats[OBS_STATE][end], dtype=torch.float32) for end in ("min", "max")]
-        reach = torch.stack([(end - self.state_mean).abs() / self.state_std for end in ends]).amax(0)
-        if wrong := [str(index) for index in torch.nonzero(~(reach <= FARTHEST_STATE)).flatten().tolist()]:
-            logging.warning(
-                "observation.state: components %s reach more than %d standard deviations from their mean, "
-                "and are clipped there; look for errors of measurement", ", ".join(wrong), FARTHEST_STATE,
-            )  # fmt: skip
-        return reach.nan_to_num(FARTHEST_STATE).clamp(STATE_LIMIT, FARTHEST_STATE)
+        state_stats = dataset_stats and dataset_stats.get(OBS_STATE)
+        scale = Scale.of(config.state_size, state_stats, STATE_MIN_STD)
+        self._register_scale("state", scale)
+        self.register_buffer("state_limit", scale.reach(state_stats))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Read checkpoints of versions that clamped every component to `STATE_LIMIT` as well."""
-        state_dict.setdefault(f"{prefix}state_limit", torch.full_like(self.state_std, STATE_LIMIT))
+        """Read checkpoints of versions that clamped every component at `REACH` as well."""
+        state_dict.setdefault(f"{prefix}state_limit", torch.full_like(self.state_std, REACH))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def train(self, mode: bool = True) -> "WorldModelRewardModel":
@@ -167,12 +138,12 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         """Take the sizes of features from the dataset, or check them against those of a trained model."""
         if self.config.pretrained_path:
             check_dataset(self.config, meta)
-        sizes, features = self.config.tokenizer, meta.features
-        check_cameras(features, sizes.camera_keys)
-        self.config.tokenizer = with_frame_sizes(sizes, features)
+        tokenizer_config, features = self.config.tokenizer, meta.features
+        check_cameras(features, tokenizer_config.camera_keys)
+        self.config.tokenizer = with_frame_sizes(tokenizer_config, features)
         if self.config.depth:
-            check_depth(features, sizes.camera_keys)
-            self._unmeasured = unmeasured_depth(features, sizes.camera_keys)
+            check_depth(features, tokenizer_config.camera_keys)
+            self._unmeasured = unmeasured_depth(features, tokenizer_config.camera_keys)
         if self.config.state_size and OBS_STATE not in features:
             logging.info("the dataset has no observation.state: the world model does without it")
         elif self.config.state_size:
@@ -180,22 +151,9 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         if self.config.state_size:
             self.config.state_size = features[OBS_STATE]["shape"][0] if OBS_STATE in features else 0
 
-    def _register_statistics(
-        self, name: str, key: str, size: int, stats: Any, least: float = 0.0, unit: Tensor | float = 1.0
-    ) -> None:
-        """Register mean and standard deviation of the feature `key`, the latter at least `least`.
-
-        unit: unit in which `MIN_SPREAD` is measured, one for each component or for all.
-        """
-        mean, std = torch.zeros(size), torch.ones(size)
-        if stats is not None and size:
-            mean = torch.as_tensor(stats[key]["mean"], dtype=torch.float32)
-            std = torch.as_tensor(stats[key]["std"], dtype=torch.float32)
-            std = std.where(std != 1, 1 + torch.finfo(std.dtype).eps)  # 1 says that it never varies
-            constant = torch.maximum(torch.as_tensor(MIN_SPREAD * unit), ROUNDING * mean.abs().clamp_min(1))
-            std = torch.where(std <= constant, 1.0, std).clamp_min(least)
-        self.register_buffer(f"{name}_mean", mean)
-        self.register_buffer(f"{name}_std", std)
+    def _register_scale(self, name: str, scale: Scale) -> None:
+        self.register_buffer(f"{name}_mean", scale.mean)
+        self.register_buffer(f"{name}_std", scale.std)
 
     def normalize_state(self, state: Tensor) -> Tensor:
         """Dataset units (…, P) to zero mean and unit spread.
@@ -246,22 +204,24 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
 
         Each window's first frame gives the context, because the batch lacks the episode's first frame.
         """
-        sizes = self.config.tokenizer
-        images = stack_cameras(batch, sizes.camera_keys, sizes.image_size)
+        tokenizer_config = self.config.tokenizer
+        images = stack_cameras(batch, tokenizer_config.camera_keys, tokenizer_config.image_size)
         shape = images.shape[:2]
         context = self.tokenizer.context(images[:, 0])
         rows = torch.arange(shape[0]).repeat_interleave(shape[1])
         tokens = self.tokenizer.encode(images.flatten(0, 1), context[rows]).unflatten(0, shape)
         depth = None
         if self.config.depth:
-            unmeasured = self._unmeasured or [0.0] * len(sizes.cameras)
-            depth = depth_of_windows(batch, sizes.camera_keys, self.tokenizer.grid, unmeasured)
+            unmeasured = self._unmeasured or [0.0] * len(tokenizer_config.cameras)
+            depth = depth_of_windows(batch, tokenizer_config.camera_keys, self.tokenizer.grid, unmeasured)
         features = None
         if self.config.predicts_success:
             first = images[:, :1].expand_as(images)
             features = self.tokenizer.success_features(first.flatten(0, 1), images.flatten(0, 1))
             features = features.unflatten(0, shape)
-        clip = clip_from_windows(tokens, batch, sizes.camera_keys[0], self.config.state_size, depth, features)
+        clip = clip_from_windows(
+            tokens, batch, tokenizer_config.camera_keys[0], self.config.state_size, depth, features
+        )
         return clip._replace(context=context)
 
 
@@ -281,7 +241,8 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         super().__init__(config, dataset_stats, **kwargs)
         low, high = map(torch.tensor, (config.embodiment.action_low, config.embodiment.action_high))
         unit = ((high - low) / 2).clamp_max(1.0) if len(low) else 1.0
-        self._register_statistics("action", ACTION, config.action_size, dataset_stats, unit=unit)
+        stats = dataset_stats and dataset_stats[ACTION]
+        self._register_scale("action", Scale.of(config.action_size, stats, unit=unit))
         width = config.dynamics.width
         self.embed_action = nn.Sequential(
             nn.Linear(config.action_size, width), nn.SiLU(), nn.Linear(width, CONDITION_TOKENS * width)
@@ -301,7 +262,7 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         """Raise FieldError if a policy's actions are in other units than those that the model learnt from."""
         check_units(policy, postprocessor, self.config.embodiment.action_names, *self.action_range())
 
-    def action_spread(self) -> Tensor:
+    def action_deviation(self) -> Tensor:
         """Return the standard deviation of each component of an action, 0 where it never varies. (A,)"""
         return torch.where(self.action_std == 1, 0.0, self.action_std)  # statistics hold 1 for constants
 

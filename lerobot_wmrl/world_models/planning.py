@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
-from lerobot_wmrl.world_models.dynamics import spread_rows
+from lerobot_wmrl.world_models.dynamics import repeated_rows
 from lerobot_wmrl.world_models.goal import imagine_goal, select_features, similarity_to_goal
 
 MIN_STD_SHARE = 0.05
@@ -93,8 +93,8 @@ class Planner:
         self.model, self.text_model = model, text_model
         self.settings, self.done_frames, self.averaged = settings, done_frames, averaged
         self.low, self.high, self.seed = low, high, seed
-        spread = model.action_spread()
-        self.std = settings.spread * (spread if searched is None else spread * searched)  # (A,)
+        deviation = model.action_deviation()
+        self.std = settings.spread * (deviation if searched is None else deviation * searched)  # (A,)
         self.reset()
 
     def reset(self) -> None:
@@ -163,7 +163,7 @@ class Planner:
         goal = imagine_goal(self.text_model, frames, instructions).decoded
 
         def similarity(actions: Tensor) -> Tensor:
-            rows = spread_rows(len(frames), len(actions), actions.device)
+            rows = repeated_rows(len(frames), len(actions), actions.device)
             features = select_features(goal.features, rows, model.tokenizer.num_cameras)
             tokens = model.open_loop(frames, actions).tokens
             return similarity_to_goal(model.tokenizer, tokens, features, frames.context[rows])

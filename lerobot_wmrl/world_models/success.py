@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lerobot_wmrl.common.images import coordinates, random_shift, soft_positions
+from lerobot_wmrl.common.instructions import distinct
 from lerobot_wmrl.world_models.text import ByteTextEncoder, check_one_each
 
 WIDTH: Final = 16
@@ -116,9 +117,8 @@ class InstructionReader(nn.Module):
 
     def forward(self, instructions: Sequence[str]) -> Tensor:
         """B instructions → (B, E). ValueError for an empty one, and for one that is too long."""
-        row_of = {text: row for row, text in enumerate(dict.fromkeys(instructions))}
-        batch = self.encoder.tokens(list(row_of))
-        return self.weights(**batch)[[row_of[text] for text in instructions]]
+        different, rows = distinct(instructions)
+        return self.weights(**self.encoder.tokens(different))[rows]
 
     def weights(self, input_ids: Tensor, attention_mask: Tensor) -> Tensor:
         """Bytes as ByT5 numbers them (U, M), and where there are any (U, M) → (U, E)."""

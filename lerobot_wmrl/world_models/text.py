@@ -20,6 +20,7 @@ from transformers import (
 from transformers.tokenization_utils_base import VERY_LARGE_INTEGER
 
 from lerobot_wmrl.common.errors import FieldError, first_line
+from lerobot_wmrl.common.instructions import distinct
 from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.world_models.condition import Condition
 
@@ -78,7 +79,7 @@ def token_limit(tokenizer: Any) -> int:
 def unreadable(instructions: Iterable[str]) -> str:
     """Return what keeps `ByteTextEncoder` from reading one of the instructions; nothing if it reads all."""
     try:
-        tokenize(ByT5Tokenizer(), list(dict.fromkeys(instructions)))
+        tokenize(ByT5Tokenizer(), distinct(list(instructions))[0])
     except ValueError as error:
         return str(error)
     return ""
@@ -163,9 +164,8 @@ class TextEncoder(nn.Module):
 
     def forward(self, instructions: Sequence[str]) -> Condition:
         """Encode B instructions. → tokens (B, 1, M, D), mask (B, 1, 1, 1, M)"""
-        row_of = {text: row for row, text in enumerate(dict.fromkeys(instructions))}
-        condition, mask = self.encode(list(row_of))
-        rows = torch.tensor([row_of[text] for text in instructions], device=mask.device)
+        different, rows = distinct(instructions)
+        condition, mask = self.encode(different)
         return Condition(condition[rows][:, None], mask[rows][:, None, None, None])
 
     def encode(self, instructions: Sequence[str]) -> tuple[Tensor, Tensor]:

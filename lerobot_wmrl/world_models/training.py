@@ -152,7 +152,7 @@ def make_sampler(
         )  # fmt: skip
     config: Any = model.config
     if model.name == "frame_tokenizer":
-        if config.tokenizer.success and not table.done_known:
+        if config.tokenizer.success and not table.has_labels:
             raise FieldError(
                 "tokenizer.success", True,
                 f"{table.dataset.root} has neither next.success nor next.done, so its frames cannot be told "
@@ -160,12 +160,15 @@ def make_sampler(
             )  # fmt: skip
         if config.tokenizer.success and table.success[episodes].any():
             require_shown(table, episodes.nonzero()[0])
-        sizes = config.tokenizer
-        frames, cameras = cached_frames(table.dataset, sizes.camera_keys, sizes.image_size), sizes.cameras
+        tokenizer_config = config.tokenizer
+        frames, cameras = (
+            cached_frames(table.dataset, tokenizer_config.camera_keys, tokenizer_config.image_size),
+            tokenizer_config.cameras,
+        )
         return FrameSampler(table, frames, episodes.nonzero()[0], cameras, batch_size, seed, config.device)
     if isinstance(config, TextWorldModelConfig):
         episodes = require_golden(table, episodes & golden_episodes(table))
-    elif not table.done_known:
+    elif not table.has_labels:
         logging.warning(
             "dataset.root=%s: has neither next.success nor next.done: the model cannot learn from it what "
             "success is. Check it afterwards (lerobot-wmrl-eval-world-model)",
@@ -257,7 +260,7 @@ def note_outcomes(
 
     A model that is trained further keeps what it has learnt from before, if that was more.
     """
-    labelled = [(table, chosen) for table, chosen in sources if table.done_known]
+    labelled = [(table, chosen) for table, chosen in sources if table.has_labels]
     learnt = [table.success[table.training(chosen)] for table, chosen in labelled]
     if not learnt and config.pretrained_path and config.learnt_successes is None:
         return  # what it has learnt before is not known

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lerobot_wmrl.common.images import coordinates, soft_positions
+from lerobot_wmrl.common.instructions import distinct
 
 GRID = 8
 """Cells on each side of the pooled feature map."""
@@ -87,12 +88,9 @@ class InstructionEncoder(nn.Module):
 
     def forward(self, instructions: Sequence[str]) -> Tensor:
         """Embed B strings, each distinct one once. → (B, LANGUAGE_SIZE)"""
-        distinct = list(dict.fromkeys(instructions))
-        device = self.project.weight.device
-        counts = torch.from_numpy(np.stack([ngram_counts(text) for text in distinct])).to(device)
-        row = {text: index for index, text in enumerate(distinct)}
-        rows = torch.tensor([row[text] for text in instructions], device=device)
-        return self.project(counts).tanh()[rows]
+        different, rows = distinct(instructions)
+        counts = torch.from_numpy(np.stack([ngram_counts(text) for text in different]))
+        return self.project(counts.to(self.project.weight.device)).tanh()[rows]
 
 
 class ObservationEncoder(nn.Module):

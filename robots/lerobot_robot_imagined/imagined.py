@@ -50,8 +50,8 @@ class ImaginedRobot(Robot):
     @property
     def cameras(self) -> dict[str, tuple[int, int, int]]:
         """Image shapes (H, W, 3) by camera."""
-        sizes = self.model.tokenizer
-        shapes = zip(sizes.cameras, sizes.frame_shapes.values(), strict=True)
+        tokenizer = self.model.tokenizer
+        shapes = zip(tokenizer.cameras, tokenizer.frame_shapes.values(), strict=True)
         return {camera.rpartition(".")[2]: (height, width, 3) for camera, (_, height, width) in shapes}
 
     @property

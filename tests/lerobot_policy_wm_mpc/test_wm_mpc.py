@@ -134,7 +134,7 @@ def test_success_after_the_end_of_the_episode_does_not_count(left, best):
             logit[first < 0, 1:4] = 2.0
             return SimpleNamespace(done_logit=logit)
 
-    model = Model(action_mean=torch.zeros(1), action_spread=lambda: torch.ones(1))
+    model = Model(action_mean=torch.zeros(1), action_deviation=lambda: torch.ones(1))
     settings = PlannerSettings(horizon=8, execute=2, samples=32, elites=1, iterations=1, knots=1)
     bound = torch.ones(1)
     planner = Planner(model, None, settings, 2, averaged=False, low=-bound, high=bound, seed=0)

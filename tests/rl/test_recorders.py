@@ -54,7 +54,7 @@ def test_rows_are_what_the_policy_saw_and_did(checkpoint: Path, tmp_path: Path) 
     table = recorded(checkpoint, tmp_path / "rollouts")
     assert table.length.tolist() == [STEPS, STEPS]
     assert np.allclose(table.action, AIM)
-    assert (table.done_known, table.success.any()) == (True, False)
+    assert (table.has_labels, table.success.any()) == (True, False)
     assert set(table.column(START_KIND)) == {KINDS.index(POLICY)}
     check_same_robot(ROBOT, table.dataset.meta)
     assert tuple(table.dataset.features[OBS_IMAGE]["shape"]) == (96, 96, 3)

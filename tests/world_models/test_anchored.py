@@ -25,10 +25,10 @@ from lerobot_wmrl.world_models.configuration_world_model import (
 )
 from lerobot_wmrl.world_models.dynamics import Imagined
 from lerobot_wmrl.world_models.modeling_world_model import (
-    STATE_SPREAD,
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
 )
+from lerobot_wmrl.world_models.scaling import STATE_MIN_STD
 from tests.trained import nested, small_tokenizer
 
 BATCH, LENGTH, TOKENS, CODES = 3, 6, 32, 20
@@ -272,7 +272,7 @@ def test_noise_of_what_hardly_varies_does_not_weigh_as_much_as_motion():
             "action": {"mean": torch.zeros(7), "std": torch.full((7,), 0.01)},
         },
     )
-    expected = torch.tensor([0.07, STATE_SPREAD, 1.0, 0.03, 0.03, 0.03, 0.03, 0.4])
+    expected = torch.tensor([0.07, STATE_MIN_STD, 1.0, 0.03, 0.03, 0.03, 0.03, 0.4])
     torch.testing.assert_close(model.state_std, expected)
     torch.testing.assert_close(model.action_std, torch.full((7,), 0.01))
 

@@ -60,7 +60,7 @@ def test_recorded_frames_are_judged_by_the_classifier(models, trained_models, sm
     assert found.done[1].tolist() == recording.table.done[rows].tolist()
     assert found.held == Outcomes.stack(predict_done(model, recording)).where(np.isin(range(6), [1, 4])).held
     assert seen_outcomes(without, recording, [1, 4]) is None
-    monkeypatch.setattr(EpisodeTable, "done_known", False)
+    monkeypatch.setattr(EpisodeTable, "has_labels", False)
     assert seen_outcomes(model, recording, [1, 4]) is None
 
 

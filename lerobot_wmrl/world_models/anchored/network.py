@@ -68,7 +68,7 @@ class StateRollout(NamedTuple):
         return StateRollout(*(tensor[:, -1:] for tensor in self))
 
 
-def spread(tensor: Tensor, rows: int) -> Tensor:
+def repeat_rows(tensor: Tensor, rows: int) -> Tensor:
     """Repeat what B first frames gave for each of their J clips: (B, …) → (`rows` = B·J, …)."""
     return tensor if len(tensor) == rows else tensor.repeat_interleave(rows // len(tensor), 0)
 
@@ -245,7 +245,7 @@ class AnchoredNetwork(FrameNetwork):
         memory = ClipMemory(length, self.window, self.head_width, codes.device)
         mean = condition.mean().expand(-1, length, -1)  # (B·J, T, D)
         scene, begin = self.encode(codes, state, context)
-        begin = StateRollout(*(spread(tensor, len(mean)) for tensor in begin))
+        begin = StateRollout(*(repeat_rows(tensor, len(mean)) for tensor in begin))
         return self.follow(scene, begin, mean, memory, steps, condition.instruction_weights)[0]
 
     def encode(self, codes: Tensor, state: Tensor, context: Context) -> tuple[EncodedScene, StateRollout]:
@@ -286,7 +286,7 @@ class AnchoredNetwork(FrameNetwork):
         Returns:
             The prediction, with logits of the frames after `steps` (B, K) alone, and the state rollout.
         """
-        rollout: StateRollout = self._unroll(begin, spread(scene.summary, len(mean)), mean)
+        rollout: StateRollout = self._unroll(begin, repeat_rows(scene.summary, len(mean)), mean)
         x = self.register + mean + self.motion(rollout.hidden) + self.state_in(rollout.state)  # (B, T, D)
         x = x[:, None]  # (B, 1, T, D): space before time
         for layer, block in enumerate(self.trajectory):
@@ -304,7 +304,7 @@ class AnchoredNetwork(FrameNetwork):
         if not count:  # convolutions refuse an empty batch
             sizes = scene.codes.shape[2], len(self.codebook.factor_of_logit)
             return hidden.new_zeros(len(hidden), 0, *sizes)
-        scene = EncodedScene(*(spread(tensor, len(hidden)) for tensor in scene))
+        scene = EncodedScene(*(repeat_rows(tensor, len(hidden)) for tensor in scene))
         x = scene.tokens.expand(-1, count, -1, -1)
         for block in self.renderer:
             x = block(x, hidden)
