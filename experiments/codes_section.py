@@ -4,11 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from experiments.cells import DOMAINS, Load, counted, estimate
-from experiments.from_one_policy import tables
-from experiments.value_cells import SCENES, Cell, groups
+from experiments.from_one_policy import changes, tables
+from experiments.value_cells import SCENES, Cell, groups, shares
 from lerobot_wmrl.common.files import markdown_table as table
 
 STUDY: Final = "codes"
+TIME_LIMIT: Final = "value_time_limit"
 
 TITLES: Final = {
     "filtered": "filtered BC, before PPO",
@@ -42,6 +43,24 @@ model). Each has the lowest threshold that lets at most 5 % of the failures amon
 rollouts pass from which both world models have learnt:
 
 {goals(cells)}"""
+
+
+def time_limit(load: Load) -> str:
+    """Return the section: success within 40 and within 80 steps, and what PPO changes within 80."""
+    later = [cell for each in groups(load, TIME_LIMIT, ()).values() for cell in each]
+    seeds = {cell["seed"] for cell in later}
+    first = [cell for each in groups(load, STUDY, ()).values() for cell in each if cell["seed"] in seeds]
+    titles = {"filtered": "filtered BC", "ppo_fsq": "PPO in imagination"}
+    rows = [
+        [title, *(shares(cells, method, domain) for domain in SCENES for cells in (first, later))]
+        for method, title in titles.items()
+    ]
+    columns = [f"{DOMAINS[domain]} scenes, {steps} steps" for domain in SCENES for steps in (40, 80)]
+    return f"""Policies of [codes](#codes), which were trained for episodes of 40 steps, evaluated with 80.
+
+{table(["method", *columns], rows)}
+
+Within 80 steps. {changes(later, titles, "filtered")}"""
 
 
 def quantizers(cells: Sequence[Cell]) -> str:

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from experiments.cells import DOMAINS, Load
+from experiments.cells import Load
 from experiments.from_one_policy import changes
 from experiments.value_cells import (
     BASELINES,
@@ -23,7 +23,6 @@ from experiments.value_cells import (
 from lerobot_wmrl.common.files import markdown_table as table
 
 STUDY: Final = "value_same_recordings"
-TIME_LIMIT: Final = "value_time_limit"
 
 LIMITS: Final = """\
 All methods of a seed have the same demonstrations and rollouts, and are compared on the same starts. The
@@ -36,41 +35,6 @@ with 8 demonstrations.
 def section(load: Load) -> str:
     """Return the section: for each number of demonstrations success, and changes on the best baseline."""
     return "\n\n".join([*(part(cells) for cells in groups(load, STUDY, ()).values()), LIMITS])
-
-
-def time_limit(load: Load) -> str:
-    """Return the section: success within 40 and within 80 steps, and changes within 80."""
-    return "\n\n".join(by_limit(load, cells) for cells in groups(load, TIME_LIMIT, ()).values())
-
-
-def by_limit(load: Load, cells: Sequence[Cell]) -> str:
-    """Return two tables of the cells of a number of demonstrations: success by limit, and what is gained."""
-    seeds = {cell["seed"] for cell in cells}
-    before = [
-        cell
-        for each in groups(load, STUDY, ()).values()
-        for cell in each
-        if cell["demonstrations"] == cells[0]["demonstrations"] and cell["seed"] in seeds
-    ]
-    methods = measured(cells, TITLES)
-    rows = [
-        [TITLES[method], *(shares(of, method, domain) for domain in SCENES for of in (before, cells))]
-        for method in methods
-    ]
-    columns = [f"{DOMAINS[domain]} scenes, {limit} steps" for domain in SCENES for limit in (40, 80)]
-    rival = best_baseline(cells)
-    compared = {method: TITLES[method] for method in methods if method in IMAGINED or method == rival}
-    return f"""**{cells[0]["demonstrations"]} demonstrations**: success within 40 steps, for which all methods
-were trained, and within 80. Seeds {", ".join(map(str, sorted(seeds)))}.
-
-{table(["method", *columns], rows)}
-
-Within 80 steps: {uncapitalised(changes(cells, compared, rival))}"""
-
-
-def uncapitalised(text: str) -> str:
-    """Return a sentence as it goes on after a colon."""
-    return text[0].lower() + text[1:]
 
 
 def part(cells: Sequence[Cell]) -> str:

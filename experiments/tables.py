@@ -79,7 +79,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_distilled_ppo": ("Policies", partial(value.rows_above, ["distilled_ppo"])),
     "value_ppo_distilled": ("Policies", partial(value.rows_above, ["ppo_distilled"])),
     "value_same_recordings": ("Policies", same_recordings_section.section),
-    "value_time_limit": ("Policies", same_recordings_section.time_limit),
+    "value_time_limit": ("Policies", codes_section.time_limit),
     "value_act": ("Policies", act_section.section),
     "value_act_controls": ("Policies", act_section.controls_section),
     "value_rewards": ("Policies", rewards_section.section),

@@ -29,6 +29,17 @@ def cell(study: Study) -> Results:
     return {study.variables["cell"]: results}
 
 
+def time_limit(study: Study) -> Results:
+    """Return the success of policies of another study within another number of steps."""
+    settings = {name: study.variables[name] for name in ("demonstrations", "rollouts", "seed", "starts")}
+    methods = {
+        name: {domain: rate(outcomes(study.folder / f"eval_{name}_{domain}")) for domain in ("ind", "ood")}
+        for name in study.variables["policies"]
+    }
+    steps = study.variables["episode_length"]
+    return {study.variables["cell"]: {**settings, "episode_length": steps, "methods": methods}}
+
+
 def four_tasks(study: Study) -> Results:
     """Return the success of one policy in each of its tasks, after every method, on the same starts.
 
