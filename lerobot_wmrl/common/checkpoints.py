@@ -3,12 +3,14 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
+import torch
 from huggingface_hub import snapshot_download
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
@@ -107,6 +109,17 @@ def local_model_folder(
     if folder.is_dir():
         return folder
     return Path(snapshot_download(str(path), revision=revision, allow_patterns=files))
+
+
+@contextmanager
+def reading_weights(described: Callable[[Exception], Exception]) -> Iterator[None]:
+    """Raise what `described` makes of an error that says that weights cannot be read, or do not fit."""
+    try:
+        yield
+    except torch.OutOfMemoryError:
+        raise
+    except (SafetensorError, RuntimeError, OSError) as error:
+        raise described(error) from error
 
 
 def given_revision(overrides: Sequence[str]) -> str | None:

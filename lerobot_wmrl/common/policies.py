@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from lerobot_wmrl.common.checkpoints import (
     given_revision,
     local_model_folder,
     may_be_on_hub,
+    reading_weights,
     settled_folder,
 )
 from lerobot_wmrl.common.constants import Observation
@@ -88,7 +90,7 @@ def check_weights(config: PreTrainedConfig) -> None:
         with safe_open(config.pretrained_path / weights_file(config), framework="pt"):
             pass
     except (SafetensorError, OSError) as error:
-        raise _unreadable(config, error) from error
+        raise unreadable_policy(config, error) from error
 
 
 def weights_file(config: PreTrainedConfig) -> str:
@@ -106,15 +108,11 @@ def load_policy(config: PreTrainedConfig) -> Any:
 
     if config.pretrained_path is None:
         return get_policy_class(config.type)(config).eval()
-    try:
+    with reading_weights(partial(unreadable_policy, config)):
         if config.use_peft:
             return load_with_adapters(config).eval()
         policy_class = get_policy_class(config.type)
         return policy_class.from_pretrained(str(config.pretrained_path), config=config, strict=True)
-    except torch.OutOfMemoryError:
-        raise
-    except (SafetensorError, RuntimeError, OSError) as error:
-        raise _unreadable(config, error) from error
 
 
 def load_processors(config: PreTrainedConfig) -> tuple[Any, Any]:
@@ -185,18 +183,18 @@ def load_with_adapters(config: PreTrainedConfig, **options: Any) -> Any:
             f"{path}: adapts the policy in {base}, which is not there; put it back, start this where its "
             "training was started, or write where it is now into adapter_config.json, base_model_name_or_path"
         )
+
+    def described(error: Exception) -> ValueError:
+        return ValueError(
+            f"{path}: adapts the policy in {base}, which cannot be read ({first_line(error)}); put back what "
+            "was adapted"
+        )
+
     policy_class = get_policy_class(config.type)
-    try:
+    with reading_weights(described):
         policy = policy_class.from_pretrained(
             base, config=config, revision=adapter.revision, strict=True, **options
         )
-    except torch.OutOfMemoryError:
-        raise
-    except (SafetensorError, RuntimeError, OSError) as error:
-        raise ValueError(
-            f"{path}: adapts the policy in {base}, which cannot be read ({first_line(error)}); put back what "
-            "was adapted"
-        ) from error
     return PeftModel.from_pretrained(policy, path, config=adapter, is_trainable=True)
 
 
@@ -237,7 +235,8 @@ def load_trained_weights(policy: Any, weights: dict[str, Any]) -> None:
         raise RuntimeError(f"the adapters do not fit the policy: {unexpected[0]} is unknown")
 
 
-def _unreadable(config: PreTrainedConfig, error: Exception) -> FieldError:
+def unreadable_policy(config: PreTrainedConfig, error: Exception) -> FieldError:
+    """Return the error for a checkpoint whose weights cannot be loaded."""
     return FieldError(
         "policy.path", config.pretrained_path,
         f"{weights_file(config)} cannot be read ({first_line(error)})",

@@ -14,7 +14,6 @@ from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import RuleBasedReward, potential_discount
 from lerobot_wmrl.rl.configuration_algorithms import AlgorithmConfig
-from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
 from lerobot_wmrl.rl.protocol import EncodingPolicy
 
@@ -66,7 +65,7 @@ def settle_discount(cfg: TrainConfig) -> None:
     """Let GRPO, which adds rewards up without a discount, be rewarded for progress without one: discounted,
     an early approach to the goal would cost more than it earns. Leave a discount that is given."""
     reward = progress_reward(cfg)
-    if isinstance(cfg.algorithm, GRPOConfig) and reward is not None and reward.gamma is None:
+    if not cfg.algorithm.discounts and reward is not None and reward.gamma is None:
         reward.gamma = 1.0
 
 

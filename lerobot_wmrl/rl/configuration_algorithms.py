@@ -4,6 +4,7 @@ import logging
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
+from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
@@ -18,6 +19,12 @@ class AlgorithmConfig(RLAlgorithmConfig):
     compares_starts: ClassVar[bool] = False
     """Whether episodes from the same start are compared with each other."""
 
+    imitates_planner: ClassVar[bool] = False
+    """Whether the policy learns what a planner does, and not from rewards."""
+
+    discounts: ClassVar[bool] = True
+    """Whether later rewards count less."""
+
     @classmethod
     def from_policy_config(cls, policy_cfg: Any) -> Self:
         """Return the defaults, which depend on no policy."""
@@ -25,6 +32,9 @@ class AlgorithmConfig(RLAlgorithmConfig):
 
     def check(self, num_envs: int, iterations: int, env: EnvConfig) -> None:
         """Raise FieldError if it cannot train in so many environments; warn if it would learn nothing."""
+
+    def check_policy(self, policy: PreTrainedConfig) -> None:
+        """Raise FieldError for a policy that it cannot train."""
 
     def discount(self, longest: int) -> float | None:
         """Return the discount factor of rewards in episodes of up to `longest` steps, None if it learns from

@@ -1,11 +1,14 @@
 """Configuration of distillation, `algorithm.type` distillation."""
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
+from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
 from lerobot_wmrl.common.errors import FieldError, require_at_least, within
+from lerobot_wmrl.common.policy_checks import require_distillable
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.rl.configuration_algorithms import AlgorithmConfig
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
@@ -41,6 +44,8 @@ class DistillationConfig(AlgorithmConfig):
         batch_size: labels in an optimizer step, in each process of `torchrun`.
     """
 
+    imitates_planner: ClassVar[bool] = True
+
     planner: FastPlanner = field(default_factory=FastPlanner)
     longest_lead: int = 16
     updates: int = 150
@@ -53,6 +58,10 @@ class DistillationConfig(AlgorithmConfig):
             self.planner.check_planner()
         require_at_least(self, 0, "longest_lead", "updates", "last_updates")
         require_at_least(self, 1, "batch_size")
+
+    def check_policy(self, policy: PreTrainedConfig) -> None:
+        """Raise FieldError for a policy that learns actions relative to the state."""
+        require_distillable(policy)
 
     def check(self, num_envs: int, iterations: int, env: EnvConfig) -> None:
         """Raise FieldError unless the planner can look ahead in the environment."""

@@ -26,6 +26,7 @@ class GRPOConfig(PolicyGradientConfig):
     """
 
     compares_starts: ClassVar[bool] = True
+    discounts: ClassVar[bool] = False
 
     group_size: int = 8
     clip_low: float = 0.2

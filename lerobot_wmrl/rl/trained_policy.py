@@ -12,7 +12,6 @@ from lerobot_wmrl.common.checkpoints import best_model, last_model
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import within
 from lerobot_wmrl.common.presets import format_lerobot_flags
-from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
 
 PATHS: Final = ("path", "root", "frames", "assets")
@@ -54,8 +53,11 @@ def summary(cfg: TrainConfig) -> list[str]:
     iterations = [line for line in read_metrics(cfg.output_dir) if "success_rate" in line]
     first, last, checkpoint = iterations[0], iterations[-1], chosen_checkpoint(cfg)
     policy, env, algorithm = cfg.policy.type, cfg.env.type, cfg.algorithm.type.upper()  # type: ignore[union-attr]
-    planner = isinstance(cfg.algorithm, DistillationConfig)
-    acted = f"the planner's success in {env}" if planner else f"success in {env} with exploration"
+    acted = (
+        f"the planner's success in {env}"
+        if cfg.algorithm.imitates_planner
+        else f"success in {env} with exploration"
+    )
     lines = [
         f"{cfg.output_dir}: {policy} policy after {last['step']} iterations of {algorithm}, "
         f"{last['env_steps']:,} steps in {env}",

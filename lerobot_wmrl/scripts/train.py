@@ -42,7 +42,6 @@ from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.common.tracking import make_wandb
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.tensor_env import TensorEnv
-from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.configuration_train import MAY_DIFFER, TrainConfig, load_config
 from lerobot_wmrl.rl.trained_policy import publish, summary
 
@@ -53,7 +52,6 @@ def train_policy(cfg: TrainConfig) -> None:
     from lerobot.utils.random_utils import set_seed
 
     from lerobot_wmrl.common.checkpoints import link_latest
-    from lerobot_wmrl.common.policy_checks import require_distillable
     from lerobot_wmrl.envs.lerobot_env import make_tensor_env
     from lerobot_wmrl.rl.budget import check_data
     from lerobot_wmrl.rl.compatibility import settle_discount
@@ -67,8 +65,7 @@ def train_policy(cfg: TrainConfig) -> None:
             "env.device", cfg.env.device, f"the policy is on {config.device}, and the world model too",
             "set `policy.device` instead",
         )  # fmt: skip
-    if isinstance(cfg.algorithm, DistillationConfig):
-        require_distillable(config)
+    cfg.algorithm.check_policy(config)
     PartialState(cpu=config.device == "cpu", timeout=LONGEST_WAIT)
     content, done = named_content(cfg, config), finished(cfg)
     wait_for_all()  # no process has written anything before all have looked

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,7 +13,13 @@ from lerobot.rewards.factory import get_reward_model_class
 from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors import SafetensorError
 
-from lerobot_wmrl.common.checkpoints import UNPUBLISHED, given_revision, may_be_on_hub, model_folder
+from lerobot_wmrl.common.checkpoints import (
+    UNPUBLISHED,
+    given_revision,
+    may_be_on_hub,
+    model_folder,
+    reading_weights,
+)
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.data.checks import check_cameras, check_depth, check_widths
 from lerobot_wmrl.data.embodiment import check_same_robot
@@ -155,12 +162,8 @@ def load_model(
     """
     config = read_config(path, expected_type, device, field)
     folder = model_folder(path)
-    try:
+    with reading_weights(partial(unreadable_weights, path)):
         model = get_reward_model_class(config.type).from_pretrained(str(folder), config=config, strict=True)
-    except torch.OutOfMemoryError:
-        raise
-    except (SafetensorError, RuntimeError, OSError) as error:
-        raise unreadable_weights(path, error) from error
     model.config.pretrained_path = str(folder)
     return model
 

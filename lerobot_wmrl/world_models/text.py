@@ -76,7 +76,7 @@ def token_limit(tokenizer: Any) -> int:
     return MAX_TOKENS if limit >= VERY_LARGE_INTEGER else int(limit)
 
 
-def unreadable(instructions: Iterable[str]) -> str:
+def instruction_problem(instructions: Iterable[str]) -> str:
     """Return what keeps `ByteTextEncoder` from reading one of the instructions; nothing if it reads all."""
     try:
         tokenize(ByT5Tokenizer(), distinct(list(instructions))[0])

@@ -48,7 +48,7 @@ from lerobot_wmrl.data.frame_cache import (
 from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model, load_model_to_continue
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig, cosine_schedule
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
-from lerobot_wmrl.world_models.text import unreadable
+from lerobot_wmrl.world_models.text import instruction_problem
 
 FAR_SHARE: Final = 0.05
 """Share of the depth that may be beyond `FAR` without a warning."""
@@ -95,7 +95,7 @@ def decide_on_instructions(config: RewardModelConfig, table: EpisodeTable, data:
     tables = [table.subset(table.training(data.episodes))]
     tables += [each.subset(each.training(None)) for each in data.read_more()]
     reads = count_tasks(tables) > 1 if asked is None else asked
-    problem = reads and unreadable(text for each in tables for text in each.instructions)
+    problem = reads and instruction_problem(text for each in tables for text in each.instructions)
     if problem and asked:
         raise FieldError(
             "tokenizer.instructions", True, problem,
@@ -183,7 +183,7 @@ def make_clip_sampler(
     """Make a sampler of clips from these episodes, with what else the model looks at or predicts."""
     config, tokenizer, dataset = model.config, model.tokenizer, table.dataset
     chosen = table.subset(episodes)
-    if config.reads_instructions and (problem := unreadable(chosen.instructions)):
+    if config.reads_instructions and (problem := instruction_problem(chosen.instructions)):
         raise FieldError(
             "dataset.root", dataset.root, problem,
             "or train a tokenizer with `tokenizer.instructions`=false, and the world model on it",
