@@ -4,10 +4,13 @@ import json
 import shutil
 from pathlib import Path
 
+import pytest
+
 from lerobot_wmrl.common.checkpoints import (
     checkpoint_digest,
     checkpoint_dir,
     link_latest,
+    may_be_on_hub,
     should_save_checkpoint,
     write_checkpoint,
 )
@@ -45,3 +48,11 @@ def test_checkpoints_are_named_and_due_as_lerobots() -> None:
     assert checkpoint_dir(Path("run"), 20_000, 500) == Path("run/checkpoints/000500")
     assert checkpoint_dir(Path("run"), 10**7, 500).name == "00000500"
     assert [step for step in range(1, 8) if should_save_checkpoint(step, 3, 7)] == [3, 6, 7]
+
+
+@pytest.mark.parametrize(("name", "on_hub"), [
+    ("user/model", True), ("outputs-lab/model", True), ("gpt2", True), ("outputs/model", False),
+    ("runs/a/model", False), ("./model", False), ("/models/a", False), ("../model", False),
+])  # fmt: skip
+def test_names_of_the_hub_have_one_owner_and_are_not_where_commands_write(name: str, on_hub: bool) -> None:
+    assert may_be_on_hub(name) == on_hub
