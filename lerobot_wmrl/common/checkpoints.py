@@ -95,7 +95,7 @@ def resolved_path(path: str) -> str:
 
 
 def resolved_name(path: str) -> str:
-    """Return the same as a name: without LeRobot's folder `pretrained_model`, in which the model is."""
+    """Return a checkpoint's folder as users name it: `resolved_path` without LeRobot's `pretrained_model`."""
     folder = Path(resolved_path(path))
     return str(folder.parent if folder.name == PRETRAINED_MODEL_DIR else folder)
 

@@ -23,6 +23,9 @@ GRIPPER_OPEN = 0.04
 FINE_LINKS = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
 """Links that keep more triangles, because their outline shows whether there is contact."""
 
+FEWEST_TRIANGLES = 120
+"""Triangles that a part of a link keeps at least."""
+
 
 @register_agent()
 class BaseAxesPanda(Panda):
@@ -118,15 +121,15 @@ def _render_bodies(robot: Any) -> Iterator[tuple[str, Any]]:
                 yield link.name, component
 
 
-def _decimated(part: Any, share: float, smallest: int = 120) -> tuple[np.ndarray, ...]:
-    """Return a mesh part with `share` of its triangles, at least `smallest`.
+def _decimated(part: Any, share: float) -> tuple[np.ndarray, ...]:
+    """Return a mesh part with `share` of its triangles, at least `FEWEST_TRIANGLES`.
 
     Returns:
         Vertices (V, 3), triangles (F, 3), normals (V, 3), and an empty array for texture coordinates.
     """
     vertices, inverse = np.unique(np.asarray(part.vertices, np.float32).round(5), axis=0, return_inverse=True)
     triangles = inverse.reshape(-1)[np.asarray(part.triangles)].astype(np.int32)
-    reduction = 1.0 - max(smallest, share * len(triangles)) / len(triangles)
+    reduction = 1.0 - max(FEWEST_TRIANGLES, share * len(triangles)) / len(triangles)
     if reduction > 0:
         vertices, triangles = fast_simplification.simplify(vertices, triangles, reduction)
     normals = _vertex_normals(vertices, triangles)

@@ -64,13 +64,13 @@ def curve(metrics: Sequence[Mapping[str, Any]], name: str, unit: str = STEP) -> 
     return Curve([float(step) for step, _ in rows], [float(value) for _, value in rows], unit)
 
 
-def lerobot_train_curve(log: Path, name: str = "loss") -> Curve:
-    """Read the log lines of lerobot-train, `… step:200 … loss:0.123 …`: it keeps its numbers nowhere else.
+def lerobot_train_curve(log: Path) -> Curve:
+    """Read the loss from the log lines of lerobot-train, `… step:200 … loss:0.123 …`: it keeps its numbers nowhere else.
 
     It writes steps from 1,000 on as thousands (`1K`): the values of each are averaged.
     """
     values: dict[float, list[float]] = {}
-    for step, value in re.findall(rf"step:(\d+K?)\b.*?\b{name}:([-\d.e]+)", log.read_text(errors="replace")):
+    for step, value in re.findall(r"step:(\d+K?)\b.*?\bloss:([-\d.e]+)", log.read_text(errors="replace")):
         at = float(step.rstrip("K")) * (1000 if step.endswith("K") else 1)
         values.setdefault(at, []).append(float(value))
     return Curve(sorted(values), [float(np.mean(values[step])) for step in sorted(values)])
