@@ -65,7 +65,7 @@ def curve(metrics: Sequence[Mapping[str, Any]], name: str, unit: str = STEP) -> 
 
 
 def lerobot_train_curve(log: Path) -> Curve:
-    """Read the loss from the log lines of lerobot-train, `… step:200 … loss:0.123 …`: it keeps its numbers nowhere else.
+    """Read the loss from the log of lerobot-train, `… step:200 … loss:0.123 …`: it keeps it nowhere else.
 
     It writes steps from 1,000 on as thousands (`1K`): the values of each are averaged.
     """
