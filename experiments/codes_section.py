@@ -63,8 +63,8 @@ def time_limit(load: Load) -> str:
     columns = [f"{DOMAINS[domain]} scenes, {steps} steps" for domain in SCENES for steps in (40, 80)]
     before, after = ("/".join(percent(later, method, domain) for domain in SCENES) for method in titles)
     return f"""It does not: with twice as many steps filtered BC succeeds in {before} % of known/unseen
-starts, and PPO from it in {after} % ({named_seeds(later)}). The policies are those of [codes](#codes), trained
-for episodes of 40 steps. Distillation was not tried with 80.
+starts, and PPO from it in {after} % ({named_seeds(later)}). The policies are those of [codes](#codes),
+trained for episodes of 40 steps. Distillation was not tried with 80.
 
 {table(["method", *columns], rows)}
 
