@@ -13,7 +13,7 @@ import numpy as np
 from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import parquet_files, read_actions
+from lerobot_wmrl.data.episodes import parquet_files, read_vectors
 
 POSITION_NAMES: Final = ("tcp_x", "tcp_y", "tcp_z")
 """First components of a state that begins with the position of the tool centre point (TCP, m)."""
@@ -142,7 +142,7 @@ def observed_range(meta: Any) -> tuple[list[float], list[float]]:
             "dataset.root", meta.root, "has no files of data here, which say in what range its actions are",
             "download it: leave out `--dataset.streaming`",
         )  # fmt: skip
-    actions = read_actions(Path(meta.root))
+    actions = read_vectors(Path(meta.root), ACTION)
     finite = actions[np.isfinite(actions).all(1)]
     if not len(finite):
         raise FieldError("dataset.root", meta.root, "none of its actions is finite", "record it again")

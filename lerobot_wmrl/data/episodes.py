@@ -296,10 +296,10 @@ def parquet_files(root: Path) -> list[Path]:
     return sorted((root / "data").glob("*/*.parquet"))
 
 
-def read_actions(root: Path) -> np.ndarray:
-    """Read all actions of a dataset on disk. (rows, A) float64"""
-    table = pyarrow.dataset.dataset(parquet_files(root), format="parquet").to_table(columns=[ACTION])
-    column = table[ACTION]
+def read_vectors(root: Path, name: str) -> np.ndarray:
+    """Read all of a column of numbers, such as the actions, of a dataset on disk. (rows, A) float64"""
+    table = pyarrow.dataset.dataset(parquet_files(root), format="parquet").to_table(columns=[name])
+    column = table[name]
     values = pyarrow.compute.list_flatten(column) if pyarrow.types.is_nested(column.type) else column
     return values.to_numpy().astype(np.float64).reshape(table.num_rows, -1)
 

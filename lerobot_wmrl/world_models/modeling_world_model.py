@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.rewards import RewardModelConfig
@@ -22,7 +23,7 @@ from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.data.checks import check_cameras, check_depth, check_episode_lengths, check_statistics
 from lerobot_wmrl.data.clips import Clip, clip_from_windows
 from lerobot_wmrl.data.embodiment import check_range, read_embodiment
-from lerobot_wmrl.data.episodes import success_column
+from lerobot_wmrl.data.episodes import parquet_files, read_vectors, success_column
 from lerobot_wmrl.data.frame_cache import depth_of_windows, unmeasured_depth
 from lerobot_wmrl.world_models.anchored.dynamics import AnchoredDynamics
 from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
@@ -111,10 +112,14 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
             done.head.load_state_dict(self.tokenizer.success.head.state_dict())  # type: ignore[union-attr]
         elif dataset_meta is not None and success_column(dataset_meta.features) is None:
             nn.init.constant_(done[-1].bias, UNLABELLED_DONE)
-        state_stats = dataset_stats and dataset_stats.get(OBS_STATE)
-        scale = Scale.of(config.state_size, state_stats, STATE_MIN_STD)
+        scale = Scale.of(config.state_size, dataset_stats and dataset_stats.get(OBS_STATE), STATE_MIN_STD)
         self._register_scale("state", scale)
-        self.register_buffer("state_limit", scale.reach(state_stats))
+        self.register_buffer("state_limit", scale.reach(self._recorded_states(dataset_meta)))
+
+    def _recorded_states(self, meta: Any) -> np.ndarray | None:
+        """Return the states (rows, P) of a dataset, None where there are none on this machine."""
+        root = None if meta is None or not self.config.state_size else Path(meta.root)
+        return read_vectors(root, OBS_STATE) if root is not None and parquet_files(root) else None
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Read checkpoints of versions that clamped every component at `REACH` as well."""
@@ -158,7 +163,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
     def normalize_state(self, state: Tensor) -> Tensor:
         """Dataset units (…, P) to zero mean and unit spread.
 
-        Clipped to what was recorded, `state_limit`. Without proprioception → (…, 0).
+        Clipped at `state_limit`. Without proprioception → (…, 0).
         """
         state = state[..., : self.config.state_size]
         return ((state - self.state_mean) / self.state_std).clamp(-self.state_limit, self.state_limit)

@@ -1,9 +1,9 @@
 """How a world model scales states and actions: by mean and standard deviation of its dataset."""
 
-import logging
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,11 +20,11 @@ gripper or the rotation of a hand held upright hardly varies: scaled by less, it
 centimetres."""
 
 REACH: Final = 5.0
-"""Standard deviations to which the scaled state is clamped, or as far as the data goes beyond: a gripper that
-is seldom open, a pose that episodes begin with."""
+"""Standard deviations to which the scaled state is clamped: rare collisions do not outweigh the rest."""
 
-FARTHEST: Final = 50.0
-"""Standard deviations beyond which a recorded state is taken for an error of measurement."""
+FREQUENT: Final = 0.995
+"""Share of the frames whose state is not clamped: a gripper that is open in one of a hundred frames may be
+ten standard deviations from its mean then."""
 
 
 class Scale(NamedTuple):
@@ -54,15 +54,11 @@ class Scale(NamedTuple):
             std = torch.where(std <= constant, 1.0, std).clamp_min(least)
         return cls(mean, std)
 
-    def reach(self, stats: Mapping[str, Any] | None) -> Tensor:
-        """Return the standard deviations to which the state's components are clamped; warn of wrong ones."""
-        if not stats or not len(self.std) or "max" not in stats:
+    def reach(self, recorded: np.ndarray | None) -> Tensor:
+        """Return the standard deviations to which components are clamped: `REACH`, or as far as `FREQUENT` of
+        the recorded values (rows, size) go beyond. (size,)"""
+        if recorded is None or not len(recorded):
             return torch.full_like(self.std, REACH)
-        ends = [torch.as_tensor(stats[end], dtype=torch.float32) for end in ("min", "max")]
-        farthest = torch.stack([(end - self.mean).abs() / self.std for end in ends]).amax(0)
-        if wrong := torch.nonzero(~(farthest <= FARTHEST)).flatten().tolist():
-            logging.warning(
-                "observation.state: components %s reach more than %d standard deviations from their mean, "
-                "and are clipped there; look for errors of measurement", ", ".join(map(str, wrong)), FARTHEST,
-            )  # fmt: skip
-        return farthest.nan_to_num(FARTHEST).clamp(REACH, FARTHEST)
+        distance = np.abs(recorded - self.mean.numpy()) / self.std.numpy()
+        frequent = np.nanquantile(np.where(np.isfinite(distance), distance, np.nan), FREQUENT, axis=0)
+        return torch.as_tensor(frequent, dtype=torch.float32).nan_to_num(REACH).clamp_min(REACH)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.embodiment import component_names
-from lerobot_wmrl.data.episodes import parquet_files, read_actions
+from lerobot_wmrl.data.episodes import parquet_files, read_vectors
 
 BINS: Final = 256
 EDGES: Final = np.linspace(-1, 1, BINS)
@@ -94,7 +94,7 @@ def dataset_statistics(dataset_meta: Any) -> NormStats | None:
     root = Path(dataset_meta.root)
     if not parquet_files(root):
         return None
-    actions = read_actions(root)
+    actions = read_vectors(root, ACTION)
     return {
         "action": action_statistics(actions, component_names(dataset_meta.features[ACTION])),
         "num_transitions": len(actions),

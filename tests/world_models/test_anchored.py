@@ -277,40 +277,6 @@ def test_noise_of_what_hardly_varies_does_not_weigh_as_much_as_motion():
     torch.testing.assert_close(model.action_std, torch.full((7,), 0.01))
 
 
-def model_of_states(least: float, most: float) -> ActionWorldModelRewardModel:
-    """A model of data whose first state component is open at 95 in 2 % of the frames, else at 3."""
-    return ActionWorldModelRewardModel(
-        ActionWorldModelConfig(**nested(SIZES)),
-        dataset_stats={
-            "observation.state": {
-                "mean": torch.tensor([4.84] + [0.0] * 7), "std": torch.tensor([12.88] + [1.0] * 7),
-                "min": torch.tensor([least] + [-1.0] * 7), "max": torch.tensor([most] + [1.0] * 7),
-            },
-            "action": {"mean": torch.zeros(7), "std": torch.ones(7)},
-        },
-    )  # fmt: skip
-
-
-def test_states_are_clipped_to_what_was_recorded(caplog):
-    """A gripper that is seldom open is seven standard deviations from its mean then."""
-    model = model_of_states(3.0, 95.0)
-    state = torch.tensor([[95.0] + [6.0] * 7, [200.0] + [0.0] * 7])
-    found = model.denormalize_state(model.normalize_state(state))
-    torch.testing.assert_close(found, torch.tensor([[95.0] + [5.0] * 7, [95.0] + [0.0] * 7]))
-    assert not caplog.text
-    broken = model_of_states(3.0, 1e6)
-    assert "observation.state: components 0 reach more than 50 standard deviations" in caplog.text
-    assert broken.state_limit.tolist() == [50.0] + [5.0] * 7
-
-
-def test_checkpoints_of_earlier_versions_keep_their_limit():
-    model = model_of_states(3.0, 95.0)
-    weights = model.state_dict()
-    assert weights.pop("state_limit")[0] > 6
-    model.load_state_dict(weights)
-    assert model.state_limit.tolist() == [5.0] * 8
-
-
 def model_of_spread(robot: Embodiment, spread: torch.Tensor) -> ActionWorldModelRewardModel:
     """A model of data whose actions vary by so much. (7,)"""
     return ActionWorldModelRewardModel(
