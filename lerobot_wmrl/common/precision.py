@@ -1,4 +1,4 @@
-"""Number format and memory: bfloat16 where the hardware multiplies in it, else float32; malloc's settings.
+"""Device, number format and memory: bfloat16 where the hardware multiplies in it, else float32; malloc.
 
 Weights, losses and optimiser states stay in float32; autocast chooses by operation (mixed precision,
 Micikevicius et al. 2018; bfloat16 needs no scaling of the loss).
@@ -57,6 +57,11 @@ def compute_in(dtype: torch.dtype, device: torch.device | str) -> torch.autocast
     """Return a context in which matrix products and convolutions run in `dtype`; float32 switches a
     surrounding autocast off."""
     return torch.autocast(torch.device(device).type, dtype=dtype, enabled=dtype != torch.float32)
+
+
+def device_setting(device: torch.device) -> str:
+    """Return a device as LeRobot's settings take it: with a number for CUDA alone (not `mps:0`)."""
+    return str(device) if device.type == "cuda" else device.type
 
 
 def computing_dtype(device: torch.device | str) -> torch.dtype:

@@ -15,6 +15,7 @@ from torch import Tensor
 from lerobot_wmrl.common.checkpoints import local_model_folder
 from lerobot_wmrl.common.constants import INSTRUCTIONS
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.precision import device_setting
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig, LearnedRewardConfig
 from lerobot_wmrl.rewards.general import potential_discount
 from lerobot_wmrl.rewards.modeling_rewards import EmbeddingRewardModel, ProxyRewardModel
@@ -40,7 +41,7 @@ def load_reward(config: RewardModelConfig, model: ActionWorldModelRewardModel, l
     Raises:
         FieldError: the reward does not fit the world model, or has to be trained first.
     """
-    device = str(model.device)
+    device = device_setting(model.device)
     if isinstance(config, GeneralConfig):
         return make_reward_model(replace(config, gamma=potential_discount(config, longest)))
     if not isinstance(config, LearnedRewardConfig):

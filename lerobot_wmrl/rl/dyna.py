@@ -14,6 +14,7 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.constants import DYNA, EVALUATION_SEED
 from lerobot_wmrl.common.errors import TrainingStopped
+from lerobot_wmrl.common.precision import device_setting
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.data.budget import budget_flags
@@ -84,7 +85,7 @@ class DynaRounds:
 
     def apply(self, records: Mapping[int, Record]) -> None:
         """Give the environment the world model of the latest round."""
-        model = load_model(self._world_model(max(records)), WORLD_MODEL, str(self.env.device))
+        model = load_model(self._world_model(max(records)), WORLD_MODEL, device_setting(self.env.device))
         self.env.adopt(model)
 
     def _new_datasets(self, iteration: int, checkpoint: Path, folder: Path) -> list[Path]:
@@ -126,7 +127,7 @@ class DynaRounds:
         if number:
             initial = str(self._world_model(self.iterations[number - 1]))
         flags: Flags = {
-            "model.path": initial, "model.device": str(self.env.device), **self.learnt.flags(),
+            "model.path": initial, "model.device": device_setting(self.env.device), **self.learnt.flags(),
             "dataset.more": more, "model.learning_rate": LEARNING_RATE,
             "steps": self.config.steps, "batch_size": self.config.batch_size,
             "save_freq": max(1, self.config.steps // 4), "seed": self.seed + number,

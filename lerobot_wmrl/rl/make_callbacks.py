@@ -7,6 +7,7 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.constants import SELECTION_SEED
 from lerobot_wmrl.common.policies import LoadedPolicy
+from lerobot_wmrl.common.precision import device_setting
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.lerobot_env import is_own
@@ -51,7 +52,7 @@ def make_recorder(settings: CallbackSettings, env: WorldModelVectorEnv) -> Recor
         return None
     if not isinstance(simulator, WmrlManiSkillEnv):
         num_envs = settings.real_num_envs
-        return EnvRecorder(simulator, model.embodiment, str(env.device), settings.budget, num_envs)
+        return EnvRecorder(simulator, model.embodiment, device_setting(env.device), settings.budget, num_envs)
     cameras = list(dict.fromkeys([*simulator.cameras, *model.tokenizer.cameras]))
     return ManiSkillRecorder(simulator, settings.real_num_envs, cameras, model.depth, settings.budget)
 

@@ -79,7 +79,7 @@ def token_limit(tokenizer: Any) -> int:
 def instruction_problem(instructions: Iterable[str]) -> str:
     """Return what keeps `ByteTextEncoder` from reading one of the instructions; nothing if it reads all."""
     try:
-        tokenize(ByT5Tokenizer(), distinct(list(instructions))[0])
+        tokenize(ByT5Tokenizer(), list(dict.fromkeys(instructions)))
     except ValueError as error:
         return str(error)
     return ""

@@ -1,7 +1,13 @@
 import pytest
 import torch
 
-from lerobot_wmrl.common.precision import compute_in, imagination_dtype, multiplies_bfloat16, training_dtype
+from lerobot_wmrl.common.precision import (
+    compute_in,
+    device_setting,
+    imagination_dtype,
+    multiplies_bfloat16,
+    training_dtype,
+)
 
 
 def test_products_are_in_the_chosen_format_and_weights_stay_as_they_are() -> None:
@@ -28,3 +34,10 @@ def test_auto_is_what_the_hardware_multiplies_in() -> None:
 def test_another_precision_is_named() -> None:
     with pytest.raises(ValueError, match=r"^precision=half: choose one of auto, float32, bfloat16"):
         training_dtype("half", "cpu")
+
+
+@pytest.mark.parametrize(("device", "setting"), [
+    ("cpu", "cpu"), ("cuda:1", "cuda:1"), ("cuda", "cuda"), ("mps:0", "mps"), ("xpu:0", "xpu"),
+])  # fmt: skip
+def test_lerobots_settings_name_devices_without_a_number_but_for_cuda(device: str, setting: str) -> None:
+    assert device_setting(torch.device(device)) == setting
