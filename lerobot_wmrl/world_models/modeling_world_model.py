@@ -117,9 +117,11 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         self.register_buffer("state_limit", scale.reach(self._recorded_states(dataset_meta)))
 
     def _recorded_states(self, meta: Any) -> np.ndarray | None:
-        """Return the states (rows, P) of a dataset, None where there are none on this machine."""
-        root = None if meta is None or not self.config.state_size else Path(meta.root)
-        return read_vectors(root, OBS_STATE) if root is not None and parquet_files(root) else None
+        """Return the states (rows, P) of a dataset, None where there are none on this machine, and for a
+        trained model, whose weights bring its reach."""
+        if meta is None or self.config.pretrained_path or not self.config.state_size:
+            return None
+        return read_vectors(Path(meta.root), OBS_STATE) if parquet_files(Path(meta.root)) else None
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Read checkpoints of versions that clamped every component at `REACH` as well."""
