@@ -175,7 +175,7 @@ def learnt_from(world_model: str, rollouts: LabelledRollouts) -> int:
     Trainings that it was continued from count too, as far as their settings and data lie on this machine.
     """
     sources = [settings.get("dataset") or {} for _, settings in _trainings(world_model, "model")]
-    learnt = [(root, source.get("episodes")) for source in sources for root in _folders(source)]
+    learnt = [(root, source.get("episodes")) for source in sources for root in _folders(source, rollouts)]
     learnt += [(str(more), None) for source in sources for more in source.get("more", ())]
     table, chosen = rollouts.table, rollouts.chosen
     same = [_same(Path(root), rollouts.root) for root, _ in learnt]
@@ -186,11 +186,13 @@ def learnt_from(world_model: str, rollouts: LabelledRollouts) -> int:
     return len(action_digests(table, chosen) & {*digests})
 
 
-def _folders(source: Mapping[str, Any]) -> list[str]:
-    """Return where the dataset that a training was given lies on this machine."""
-    if source.get("root"):
-        return [str(source["root"])]
-    return [str(path) for path in local_copies(source["repo_id"])] if source.get("repo_id") else []
+def _folders(source: Mapping[str, Any], rollouts: LabelledRollouts) -> list[str]:
+    """Return where the dataset that a training was given lies on this machine: where the rollouts do, if they
+    have its name."""
+    root, repo_id = source.get("root"), source.get("repo_id")
+    if root or not repo_id:
+        return [str(root)] if root else []
+    return [str(rollouts.root)] if repo_id == rollouts.name else [str(path) for path in local_copies(repo_id)]
 
 
 def learnt_digests(root: Path, episodes: Sequence[int] | None) -> set[str]:

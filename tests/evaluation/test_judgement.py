@@ -367,6 +367,8 @@ def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
     shutil.copytree(model_folder(config.world_model.path), copy)
     write(copy / "train_config.json", {"dataset": {"repo_id": "user/rollouts"}})
     assert learnt_from(str(copy), LabelledRollouts.read(again)) == 0, "nothing is downloaded to find out"
+    of_that_name = replace(LabelledRollouts.read(again), name="user/rollouts")
+    assert learnt_from(str(copy), of_that_name) == 6
     monkeypatch.setattr("lerobot_wmrl.data.dataset.HF_LEROBOT_HUB_CACHE", tmp_path / "hub")
     shutil.copytree(
         small_dataset.root, tmp_path / "hub" / "datasets--user--rollouts" / "snapshots" / "c0ffee"
