@@ -154,7 +154,7 @@ async def measure(world: World, maniskill: bool, exported: Path | None, steps: i
     found: dict[str, list[float]] = {"page": [], **{name: [] for name in works}}
     with TemporaryDirectory() as folder, ExitStack() as stack:
         local = None if exported is None else stack.enter_context(browser(exported))
-        saved = SavedEpisodes(Path(folder) / "driven", world.model.embodiment, world.done_frames)
+        saved = SavedEpisodes(Path(folder) / "driven", world.model.embodiment, world.criterion.frames)
         server = TestServer(PlayServer(world, saved, "127.0.0.1").application())
         await server.start_server()
         async with (

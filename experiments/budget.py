@@ -67,7 +67,7 @@ def begin(study: Study) -> None:
     if study.limits is None:
         return
     from lerobot_wmrl.common.errors import FieldError
-    from lerobot_wmrl.data.budget import Ledger, Limits
+    from lerobot_wmrl.data.ledger import Ledger, Limits
 
     check_commands(study)
     try:
@@ -117,9 +117,9 @@ def check_datasets(study: Study, step: Step, checked: frozenset[Source] = frozen
     if study.limits is None:
         return checked
     from lerobot_wmrl.common.errors import FieldError, renamed
-    from lerobot_wmrl.data.budget import Ledger
     from lerobot_wmrl.data.dataset import open_dataset
     from lerobot_wmrl.data.episodes import read_episodes
+    from lerobot_wmrl.data.ledger import Ledger
 
     found = {each for each in sources(step) if each.recorded} - checked
     for source in sorted(found, key=lambda each: each[:2]):

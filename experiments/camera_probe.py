@@ -22,6 +22,7 @@ from tqdm import tqdm, trange
 
 from experiments.camera_frames import CANDIDATES, Frames, frames_of
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.images import from_bytes
 from lerobot_wmrl.maniskill.tasks import TASKS
 
 NAMES = ("object_x", "object_y", "object_z", "tcp_x", "tcp_y", "tcp_z")
@@ -109,7 +110,7 @@ def probe(cameras: list[str], frames: Frames, steps: int) -> dict[str, Any]:
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, steps)
 
     def read(rows: Tensor) -> Tensor:
-        return model([picture[rows].float() / 255 for picture in pictures])
+        return model([from_bytes(picture[rows]) for picture in pictures])
 
     train_rows, test_rows = (torch.from_numpy(mask.nonzero()[0]) for mask in (train, ~train))
     for _ in trange(steps, desc="Probing", unit="step", leave=False):

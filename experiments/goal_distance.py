@@ -20,6 +20,7 @@ import torch
 
 from experiments.reward_curves import recorded, with_recorded_actions
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.evaluation.gate import gate_at
 from lerobot_wmrl.evaluation.outcomes import Outcomes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -65,10 +66,10 @@ def compare(first: Mapping[str, Outcomes], others: Mapping[str, Mapping[str, Out
     """Return each measure's gate in the first dataset, where its threshold is chosen, and in the others."""
     found: dict[str, Any] = {}
     for measure, chosen in first.items():
-        threshold = lowest_threshold(chosen)
+        criterion = SuccessCriterion(lowest_threshold(chosen), FRAMES)
         found[measure] = {
-            "chosen": gate_at(chosen, threshold, FRAMES).as_json(),
-            **{name: gate_at(each[measure], threshold, FRAMES).as_json() for name, each in others.items()},
+            "chosen": gate_at(chosen, criterion).as_json(),
+            **{name: gate_at(each[measure], criterion).as_json() for name, each in others.items()},
         }
     return found
 

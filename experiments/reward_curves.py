@@ -32,6 +32,7 @@ from torch import Tensor
 from experiments.figures import COLOURS, tidy
 from lerobot_wmrl.common.files import markdown_table, write_json
 from lerobot_wmrl.common.statistics import Estimate
+from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
@@ -162,7 +163,7 @@ def warnings(uncertainty: Mapping[str, np.ndarray], outcomes: Outcomes) -> dict[
 
     The maximum is taken up to the frame of the prediction, as the environment's guard would see it.
     """
-    first = outcomes.first_predicted_success(THRESHOLD, FRAMES)
+    first = outcomes.first_predicted_success(SuccessCriterion(THRESHOLD, FRAMES))
     called, end = outcomes.where(first >= 0), first[first >= 0] + FRAMES
     seen = np.arange(called.done.shape[1]) < end[:, None]
     false = np.repeat(~called.success[:, None], called.done.shape[1], 1)

@@ -18,6 +18,7 @@ import torch
 from lerobot_wmrl.common.constants import START_TASK, TASK_NAMES
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_features
@@ -48,7 +49,7 @@ def other_instructions(tasks: np.ndarray, instructions: Sequence[str]) -> list[s
     return [instructions[rng.choice(np.flatnonzero(tasks != task))] for task in tasks]
 
 
-def told(model: Any, table: EpisodeTable, threshold: float, frames: int) -> dict[str, Any]:
+def told(model: Any, table: EpisodeTable, criterion: SuccessCriterion) -> dict[str, Any]:
     """Return the gate of each task on recorded frames, and how many of the successes that it tells also count
     under the instruction of another task."""
     tasks = table.column(START_TASK)
@@ -57,10 +58,10 @@ def told(model: Any, table: EpisodeTable, threshold: float, frames: int) -> dict
     found = {}
     for task in np.unique(tasks):
         of_task = tasks == task
-        recognised = of_task & own.success & (own.first_predicted_success(threshold, frames) >= 0)
-        confused = recognised & (other.first_predicted_success(threshold, frames) >= 0)
+        recognised = of_task & own.success & own.predicted_success(criterion)
+        confused = recognised & other.predicted_success(criterion)
         found[TASK_NAMES[task]] = {
-            **gate_at(own.where(of_task), threshold, frames).as_json(),
+            **gate_at(own.where(of_task), criterion).as_json(),
             "under_another_instruction": Proportion(int(confused.sum()), int(recognised.sum())).as_json(),
         }
     return found
@@ -82,9 +83,8 @@ def main() -> None:
     """Entry point."""
     given = make_parser().parse_args()
     model = load_model(given.tokenizer, "frame_tokenizer", "cpu")
-    write_json(
-        given.output, told(model, read_episodes(open_dataset(given.root)), given.threshold, given.frames)
-    )
+    criterion = SuccessCriterion(given.threshold, given.frames)
+    write_json(given.output, told(model, read_episodes(open_dataset(given.root)), criterion))
 
 
 if __name__ == "__main__":

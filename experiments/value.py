@@ -9,9 +9,9 @@ from experiments.choose_policy import chosen_policy
 from experiments.run import read_record
 from experiments.study import Study
 from experiments.success import Results, outcomes, rate
-from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.data.ledger import Ledger
 from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE
 
 CELL: Final = ("task", "kind", "demonstrations", "rollouts", "seed", "starts")

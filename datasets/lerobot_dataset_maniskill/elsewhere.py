@@ -14,10 +14,10 @@ from lerobot_wmrl.common.constants import POLICY
 from lerobot_wmrl.common.errors import renamed
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.presets import flag_as_typed
-from lerobot_wmrl.data.budget import spending
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.features import describe_alike
+from lerobot_wmrl.data.ledger import spending
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.rollout_recorder import RolloutRecorder
 

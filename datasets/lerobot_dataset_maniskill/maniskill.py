@@ -17,7 +17,7 @@ from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report
 from lerobot_wmrl.common.actions import warn_of_clipped
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.policy_checks import fit_to_environment
-from lerobot_wmrl.data.budget import spending
+from lerobot_wmrl.data.ledger import spending
 from lerobot_wmrl.maniskill.backend import render_backend, simulating_context
 from lerobot_wmrl.maniskill.embodiment import ACTION_NAMES
 

@@ -101,9 +101,9 @@ def run(config: RecordConfig) -> None:
 
 def check_shards(config: RecordConfig) -> None:
     """Raise FieldError unless the shards are in the ledger, if one is given: then it knows the whole too."""
-    from lerobot_wmrl.data.budget import Ledger
     from lerobot_wmrl.data.dataset import open_dataset
     from lerobot_wmrl.data.episodes import read_episodes
+    from lerobot_wmrl.data.ledger import Ledger
 
     if config.budget is not None:
         with renamed("dataset.root", "merge_shards"):

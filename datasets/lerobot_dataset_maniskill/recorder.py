@@ -19,9 +19,9 @@ from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.files import foreign_files, write_json, writing
 from lerobot_wmrl.common.output_folders import hold_lock
 from lerobot_wmrl.common.policies import check_weights
-from lerobot_wmrl.data.budget import IMAGINED, ROLLOUTS, Ledger
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.data.ledger import IMAGINED, ROLLOUTS, Ledger
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 
@@ -38,7 +38,7 @@ class Source(Protocol):
 
     @property
     def spent(self) -> Counter[str]:
-        """What the episodes cost of a budget (`data.budget.spending`), if they are real."""
+        """What the episodes cost of a budget (`data.ledger.spending`), if they are real."""
 
     def check(self) -> None:
         """Raise ValueError where nothing can be recorded."""

@@ -27,6 +27,7 @@ from lerobot_dataset_maniskill.writer import HOLD_FRAMES, StartColumns, StepResu
 from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import KINDS, PLAY
 from lerobot_wmrl.common.exploration import ExplorationNoise
+from lerobot_wmrl.common.images import from_bytes
 from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.common.processes import own_progress_lock
 from lerobot_wmrl.data.dataset import save_episode
@@ -100,7 +101,7 @@ def out_of_range(actions: Tensor) -> list[float]:
 def policy_observation(frame: Frame, instruction: str) -> dict[str, Any]:
     """Return a batch of one in LeRobot's names: images (1, 3, H, W) in [0, 1], state (1, 8), task."""
     images = {
-        f"observation.images.{camera}": torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255.0
+        f"observation.images.{camera}": from_bytes(torch.from_numpy(image).permute(2, 0, 1)[None])
         for camera, image in frame.images.items()
     }
     return {**images, "observation.state": torch.from_numpy(frame.state)[None], "task": [instruction]}

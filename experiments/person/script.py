@@ -56,7 +56,7 @@ class Hands:
 def drive_by_keys(world: World, episode: int, frames: int) -> tuple[list[list[float]], Drive]:
     """Drive from an episode's first frame until success, at most so many frames. Return the actions."""
     drive = world.begin({"episode": episode, "frame": 0}, None)
-    hands, planner = Hands(world.axes()), PlannerDriver(SEARCH, world.done_frames, world.policy)
+    hands, planner = Hands(world.axes()), PlannerDriver(SEARCH, world.criterion.frames, world.policy)
     actions: list[list[float]] = []
     while not drive.ended and len(actions) < frames:
         wanted = planner.act(drive)[0].numpy()

@@ -1,7 +1,8 @@
-"""Publishing on the Hugging Face hub: who is logged in, and what the hub's errors mean."""
+"""The Hugging Face hub: who is logged in, what its errors mean, and its cache on disk."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Final
 
 import httpx
@@ -14,6 +15,12 @@ PUSH: Final = "push_to_hub"
 
 DENIED: Final = (401, 403, 404)
 """HTTP statuses for a token that may not write. The hub answers 404 for what the token may not see."""
+
+
+def cached_repo(folder: Path) -> str | None:
+    """Return the name of the repository in the hub's cache (`datasets--user--name`) of which a folder is a
+    revision, None if it is none."""
+    return folder.parents[1].name if folder.parent.name == "snapshots" else None
 
 
 def check_login() -> None:

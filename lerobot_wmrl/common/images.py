@@ -23,6 +23,11 @@ def to_bytes(images: Tensor) -> Tensor:
     return (images * 255).round().byte()
 
 
+def from_bytes(images: Tensor) -> Tensor:
+    """Convert images from uint8 to [0, 1]."""
+    return images.float() / 255
+
+
 def to_pixels(images: Tensor) -> np.ndarray:
     """Return images in [0, 1], or uint8 already, as numpy's libraries want them. (…, C, H, W) → uint8
     (…, H, W, C)"""

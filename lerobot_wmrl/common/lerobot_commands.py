@@ -12,6 +12,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, step_folders
+from lerobot_wmrl.common.hub import cached_repo
 from lerobot_wmrl.common.presets import Flags, format_lerobot_flags
 
 DERIVED = ("features", "features_map")
@@ -50,10 +51,13 @@ def edit_command(folder: Path, operation: str, flags: Flags) -> list[str]:
 
 
 def edit_advice(root: str | Path, operation: str, flags: Flags) -> str:
-    """Return lerobot-edit-dataset as one types it, to make a changed copy of a dataset on disk beside it."""
+    """Return lerobot-edit-dataset as one types it, to make a changed copy of a dataset on disk: beside it, or
+    in the folder `data` of one in the hub's cache, which is cleaned."""
     source = Path(root).absolute() if not Path(root).name else Path(root)
-    flags = {"repo_id": f"local/{source.name}", "root": str(source), **flags}
-    return shlex.join(edit_command(source.with_name(f"{source.name}_edited"), operation, flags))
+    repo = cached_repo(source.absolute())
+    copied = source if repo is None else Path("data") / repo.rpartition("--")[2]
+    flags = {"repo_id": f"local/{copied.name}", "root": str(source), **flags}
+    return shlex.join(edit_command(copied.with_name(f"{copied.name}_edited"), operation, flags))
 
 
 def flat(settings: Any, encoded: Mapping[str, Any]) -> dict[str, Any]:

@@ -68,13 +68,16 @@ def observation_features(
 def matched(recorded: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str, Any]:
     """Return the features with which a recording, `recorded`, can be merged with a dataset of `columns`.
 
+    Numbers are recorded in the dataset's type (`row_in`), if that holds them.
+
     Raises:
-        FieldError: the dataset has a column that a rollout lacks, or has in another shape or type.
+        FieldError: the dataset has a column that a rollout lacks, or has in another shape or kind.
     """
     wanted = {name: dict(feature) for name, feature in columns.items() if name not in DEFAULT_FEATURES}
     for name, feature in wanted.items():
-        actual, needed = (_kept_as(each) for each in (recorded.get(name), feature))
-        if actual != needed:
+        found = recorded.get(name)
+        actual, needed = _kept_as(found), _kept_as(feature)
+        if actual != needed and not (found and _holds(feature, found)):
             raise FieldError(
                 "like.root", name, f"the dataset has it as {needed}, a rollout has {actual}",
                 "give `like_columns=false`, and the recording as `dataset.more` to what learns from it",
@@ -82,6 +85,28 @@ def matched(recorded: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str
         if "info" in feature and feature["dtype"] == "video":
             feature.pop("info")  # the encoder's, which LeRobot writes
     return wanted
+
+
+def row_in(features: Mapping[str, Any], row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row's values of the columns that a dataset has, numbers in its types."""
+    return {
+        name: np.asarray(value, features[name]["dtype"]) if _is_number(features[name]) else value
+        for name, value in row.items()
+        if name in features
+    }
+
+
+def _is_number(feature: Mapping[str, Any]) -> bool:
+    return feature["dtype"] not in ("image", "video", "string")
+
+
+def _holds(feature: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether a column of numbers can hold another: whole ones hold no fractions, and flags no numbers."""
+    return (
+        _is_number(feature) and _is_number(other)
+        and tuple(feature["shape"]) == tuple(other["shape"])
+        and np.can_cast(other["dtype"], feature["dtype"], "same_kind")
+    )  # fmt: skip
 
 
 def _kept_as(feature: Mapping[str, Any] | None) -> str:

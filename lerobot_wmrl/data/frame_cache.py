@@ -24,7 +24,8 @@ from torch.nn import functional as F
 
 from lerobot_wmrl.common.checkpoints import weights_digest
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.images import stretch
+from lerobot_wmrl.common.hub import cached_repo
+from lerobot_wmrl.common.images import from_bytes, stretch
 from lerobot_wmrl.data.checks import depth_key
 from lerobot_wmrl.data.decoding import decode, decode_depth, row_parts
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
@@ -67,8 +68,8 @@ def cache_dir(dataset: LeRobotDataset) -> Path:
     """Return the folder of a dataset's caches: beside it, or, in the hub's cache, in LeRobot's folder."""
     root = Path(dataset.root).absolute()
     root = root.resolve() if ".." in root.parts else root
-    if root.parent.name == "snapshots":  # the hub's cache has nothing else there
-        return HF_LEROBOT_HOME / "frames" / f"{root.parents[1].name}-{root.name}.cache"
+    if repo := cached_repo(root):  # which has nothing else there
+        return HF_LEROBOT_HOME / "frames" / f"{repo}-{root.name}.cache"
     return root.with_name(root.name + ".cache")
 
 
@@ -169,7 +170,7 @@ def encoded_path(
 
 def frames_to_tensor(frames: np.ndarray) -> Tensor:
     """uint8 (B, N, H, W, 3) → float32 (B, N, 3, H, W) in [0, 1]."""
-    return torch.from_numpy(np.array(frames)).permute(0, 1, 4, 2, 3).float() / 255
+    return from_bytes(torch.from_numpy(np.array(frames)).permute(0, 1, 4, 2, 3))
 
 
 def file_stamps(dataset: LeRobotDataset) -> list[object]:

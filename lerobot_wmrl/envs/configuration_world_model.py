@@ -13,6 +13,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 from lerobot_wmrl.common.constants import DONE_FRAMES, DONE_THRESHOLD, TASK_NAMES
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_probability
 from lerobot_wmrl.common.images import camera_key
+from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
@@ -187,6 +188,11 @@ class WorldModelEnv(EnvConfig):
         if self.episode_length is None:
             raise ValueError("world_model_path: is missing; it says how long episodes are")
         return self.episode_length
+
+    @property
+    def criterion(self) -> SuccessCriterion:
+        """What makes an imagined success."""
+        return SuccessCriterion(self.done_threshold, self.done_frames)
 
     @property
     def judged_frames(self) -> int | None:

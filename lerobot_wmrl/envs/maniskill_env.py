@@ -14,6 +14,7 @@ from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
 from lerobot_wmrl.common.constants import EVALUATION_SEED, Observation
+from lerobot_wmrl.common.images import from_bytes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.scene_results import CountingAsyncVectorEnv, CountingSyncVectorEnv
 from lerobot_wmrl.envs.tensor_env import Outcome, TensorEnv
@@ -210,8 +211,7 @@ def observation_space(config: WmrlManiSkillEnv) -> gym.spaces.Dict:
 def image_observations(images: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Turn camera → (B, H, W, 3) uint8 into `observation.images.<camera>` → (B, 3, H, W) in [0, 1]."""
     return {
-        f"{OBS_IMAGES}.{camera}": image.permute(0, 3, 1, 2).float() / 255.0
-        for camera, image in images.items()
+        f"{OBS_IMAGES}.{camera}": from_bytes(image.permute(0, 3, 1, 2)) for camera, image in images.items()
     }
 
 

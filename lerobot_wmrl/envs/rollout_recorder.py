@@ -34,7 +34,7 @@ from lerobot_wmrl.data.embodiment import (
     read_embodiment,
     recorded_range,
 )
-from lerobot_wmrl.data.features import encoder_of, episode_features, matched, observation_row
+from lerobot_wmrl.data.features import encoder_of, episode_features, matched, observation_row, row_in
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.lerobot_env import FRAME_LIMIT, counts_resets, freeze_finished
 
@@ -190,7 +190,7 @@ class RolloutRecorder:
                 "next.done": np.array([step == length - 1 if labelled else solved]),
                 START_SEED: np.array([seed]), START_KIND: np.array([KINDS.index(POLICY)]),
             }  # fmt: skip
-            kept = {key: value for key, value in frame.items() if key in dataset.features}
+            kept = row_in(dataset.features, frame)
             dataset.add_frame({**kept, "task": (observation.get("task") or [""])[row]})
         save_episode(dataset)
         return success

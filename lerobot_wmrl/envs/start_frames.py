@@ -18,9 +18,9 @@ from lerobot_wmrl.common.constants import INSTRUCTIONS, START_SCENE, START_TASK,
 from lerobot_wmrl.common.errors import FieldError, renamed, within
 from lerobot_wmrl.common.images import stretch, to_pixels
 from lerobot_wmrl.common.statistics import evenly_spaced
-from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.episodes import EpisodeTable, choose_episodes, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
+from lerobot_wmrl.data.ledger import Ledger
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.maniskill.recordings import require_unreported, scene_splits

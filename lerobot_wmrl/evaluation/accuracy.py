@@ -10,6 +10,7 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_wmrl.common.statistics import Estimate, Proportion, bootstrap_ratio, evenly_spaced
+from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.embodiment import POSITION_NAMES, component_names
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frames import Context
@@ -22,7 +23,6 @@ from lerobot_wmrl.evaluation.image_metrics import (
     psnr,
     ssim,
 )
-from lerobot_wmrl.evaluation.outcomes import first_run
 from lerobot_wmrl.evaluation.replay import (
     BATCH,
     DELTA_PSNR_SECONDS,
@@ -248,7 +248,7 @@ class Robustness:
 @torch.no_grad()
 def robustness(
     model: ActionWorldModelRewardModel, recording: Recording, episodes: np.ndarray,
-    threshold: float, frames: int,
+    criterion: SuccessCriterion,
 ) -> Robustness:  # fmt: skip
     """Imagine `HORIZON_SECONDS` under each kind of extreme actions, from at most `BATCH` starts.
 
@@ -262,7 +262,7 @@ def robustness(
     result = Robustness(len(episodes), horizon, absolute, {}, {})
     for name, actions in made.items():
         imagined = imagine_frames(model, starts, actions)
-        predicted = first_run((imagined.done_probability >= threshold).cpu().numpy(), frames) >= 0
+        predicted = criterion.first_met(imagined.done_probability.cpu().numpy()) >= 0
         pair = starts.tokens, imagined.tokens[:, -1]
         first, last = (model.tokenizer.decode(tokens, starts.context) for tokens in pair)
         result.predicted_success[name] = Proportion.of(predicted)

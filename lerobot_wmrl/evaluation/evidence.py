@@ -77,7 +77,7 @@ def replayed_rollouts(env: WorldModelEnv, rollouts: LabelledRollouts) -> Outcome
 
 def confusion_of(outcomes: Outcomes, env: WorldModelEnv) -> tuple[Confusion, list[str]]:
     """Return the world model's confusion where the environment ends an episode, and what biases it."""
-    gate = gate_at(outcomes, env.done_threshold, env.done_frames)
+    gate = gate_at(outcomes, env.criterion)
     warnings = []
     short = int((outcomes.length[~outcomes.success] < env.horizon).sum())
     if short:

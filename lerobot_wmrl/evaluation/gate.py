@@ -12,8 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from lerobot_wmrl.common.constants import DONE_FRAMES, DONE_THRESHOLD
 from lerobot_wmrl.common.statistics import Estimate, Proportion
+from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.evaluation.outcomes import Outcomes, labelled_recording, predict_outcomes
@@ -26,9 +26,8 @@ MIN_RECALL: Final = 0.9
 DOUBTFUL_AUC: Final = 0.8
 """AUC of successes against failures below which a reward says little."""
 
-SWEEP_THRESHOLDS = tuple(round(0.3 + 0.05 * step, 2) for step in range(14))
-SWEEP_FRAMES = tuple(range(1, 7))
-
+SWEEP_THRESHOLDS: Final = tuple(round(0.3 + 0.05 * step, 2) for step in range(14))
+SWEEP_FRAMES: Final = tuple(range(1, 7))
 
 MIN_PROBABILITY: Final = 1e-6
 """Keeps the log loss of an event finite that was predicted as impossible."""
@@ -36,21 +35,19 @@ MIN_PROBABILITY: Final = 1e-6
 
 @dataclass(frozen=True)
 class Gate:
-    """The gate at one operating point.
+    """The gate at one criterion of success.
 
     Args:
-        threshold: done probability that counts as done.
-        frames: consecutive frames for which it must be reached.
+        criterion: what counts as a predicted success.
         false_positives: of the recorded failures, those predicted as successes.
         recall: of the recorded successes, those predicted as successes.
-        cut_short: episodes that end before their success has held for `frames` frames.
+        cut_short: episodes that end before their success has held for the criterion's frames.
         repeats_last: whether the prediction for the last frame is repeated (`Outcomes.padded_probability`);
             if not, no model can predict the successes that are cut short.
         auc: area under the ROC curve over all thresholds, `Outcomes.auc`.
     """
 
-    threshold: float
-    frames: int
+    criterion: SuccessCriterion
     false_positives: Proportion
     recall: Proportion
     cut_short: int
@@ -64,8 +61,8 @@ class Gate:
 
     def as_json(self) -> dict[str, Any]:
         return {
-            "done_threshold": self.threshold,
-            "done_frames": self.frames,
+            "done_threshold": self.criterion.threshold,
+            "done_frames": self.criterion.frames,
             "false_positive_rate": self.false_positives.as_json(),
             "recall": self.recall.as_json(),
             "successes_cut_short": self.cut_short,
@@ -76,10 +73,7 @@ class Gate:
 
 
 def success_gate(
-    model: ActionWorldModelRewardModel,
-    dataset_root: str | Path,
-    threshold: float = DONE_THRESHOLD,
-    frames: int = DONE_FRAMES,
+    model: ActionWorldModelRewardModel, dataset_root: str | Path, criterion: SuccessCriterion
 ) -> Gate:
     """Replay every episode of a dataset of rollouts open loop and count false positives and recall.
 
@@ -87,26 +81,29 @@ def success_gate(
         FieldError: the model cannot replay the dataset, or its episodes have no labels of success.
     """
     recording = labelled_recording(model, read_episodes(open_dataset(dataset_root)))
-    return gate_at(predict_outcomes(model, recording), threshold, frames)
+    return gate_at(predict_outcomes(model, recording), criterion)
 
 
-def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:
-    """Count false positives and recall at one operating point."""
-    predicted, success = outcomes.first_predicted_success(threshold, frames) >= 0, outcomes.success
+def gate_at(outcomes: Outcomes, criterion: SuccessCriterion) -> Gate:
+    """Count false positives and recall at one criterion of success."""
+    predicted, success = outcomes.predicted_success(criterion), outcomes.success
     return Gate(
-        threshold=threshold,
-        frames=frames,
+        criterion=criterion,
         false_positives=Proportion.of(predicted[~success]),
         recall=Proportion.of(predicted[success]),
-        cut_short=int(outcomes.cut_short(frames).sum()),
-        repeats_last=outcomes.ends_at_success(frames),
-        auc=outcomes.auc(frames),
+        cut_short=int(outcomes.cut_short(criterion.frames).sum()),
+        repeats_last=outcomes.ends_at_success(criterion.frames),
+        auc=outcomes.auc(criterion.frames),
     )
 
 
 def sweep(outcomes: Outcomes) -> list[Gate]:
-    """Return the gate at every operating point, from the same replay."""
-    return [gate_at(outcomes, at, frames) for frames in SWEEP_FRAMES for at in SWEEP_THRESHOLDS]
+    """Return the gate at every criterion of success, from the same replay."""
+    return [
+        gate_at(outcomes, SuccessCriterion(threshold, frames))
+        for frames in SWEEP_FRAMES
+        for threshold in SWEEP_THRESHOLDS
+    ]
 
 
 def best_operating_point(gates: Sequence[Gate]) -> Gate | None:
@@ -116,8 +113,8 @@ def best_operating_point(gates: Sequence[Gate]) -> Gate | None:
     that the episodes are long enough for, then to the strictest.
     """
 
-    def merit(gate: Gate) -> tuple[float, ...]:
-        return gate.recall.k, -gate.false_positives.k, not gate.repeats_last, gate.threshold, gate.frames
+    def merit(gate: Gate) -> tuple[int, int, bool, SuccessCriterion]:
+        return gate.recall.k, -gate.false_positives.k, not gate.repeats_last, gate.criterion
 
     allowed = [
         gate
@@ -127,9 +124,8 @@ def best_operating_point(gates: Sequence[Gate]) -> Gate | None:
     return max(allowed, key=merit, default=None)
 
 
-def gate_details(outcomes: Outcomes, threshold: float, frames: int) -> dict[str, Any]:
-    """Return the gate at one operating point for metrics.json: counts, rates and every episode's outcome."""
-    gate = gate_at(outcomes, threshold, frames)
+def gate_details(outcomes: Outcomes, gate: Gate) -> dict[str, Any]:
+    """Return the gate of these outcomes for metrics.json: counts, rates and every episode's outcome."""
     return {
         "failures": gate.false_positives.n,
         "false_positives": gate.false_positives.k,
@@ -137,7 +133,7 @@ def gate_details(outcomes: Outcomes, threshold: float, frames: int) -> dict[str,
         "true_positives": gate.recall.k,
         **gate.as_json(),
         "episodes": outcomes.episodes.tolist(),
-        "predicted_success": (outcomes.first_predicted_success(threshold, frames) >= 0).tolist(),
+        "predicted_success": outcomes.predicted_success(gate.criterion).tolist(),
         "recorded_success": outcomes.success.tolist(),
     }
 
@@ -153,9 +149,9 @@ def precision_recall_f1(predicted: np.ndarray, target: np.ndarray) -> dict[str, 
     }
 
 
-def done_delay(outcomes: Outcomes, threshold: float, frames: int) -> np.ndarray:
+def done_delay(outcomes: Outcomes, criterion: SuccessCriterion) -> np.ndarray:
     """Return the frames from the recorded to the predicted first success, NaN unless both exist. (E,)"""
-    begin = outcomes.first_predicted_success(threshold, frames)
+    begin = outcomes.first_predicted_success(criterion)
     return np.where((begin >= 0) & outcomes.success, begin - outcomes.done.argmax(1), np.nan)
 
 
@@ -167,16 +163,16 @@ def done_log_loss(outcomes: Outcomes) -> Estimate:
     return Estimate.ratio(losses.sum(1), frames.sum(1))
 
 
-def done_accuracy(outcomes: Outcomes, threshold: float, frames: int) -> dict[str, Estimate]:
+def done_accuracy(outcomes: Outcomes, criterion: SuccessCriterion) -> dict[str, Estimate]:
     """Measure the done signal: `done_*` over frames, `episode_*` as the environment ends episodes, delay.
 
     outcomes: with success as the model was taught it (`Outcomes.as_taught`).
     """
-    fired = outcomes.probability >= threshold
-    predicted = outcomes.first_predicted_success(threshold, frames) >= 0
+    fired = outcomes.probability >= criterion.threshold
+    predicted = outcomes.predicted_success(criterion)
     per_frame = precision_recall_f1(fired, outcomes.done)
     per_episode = precision_recall_f1(predicted, outcomes.success)
-    delay = done_delay(outcomes, threshold, frames)
+    delay = done_delay(outcomes, criterion)
     return {
         **{f"done_{name}": estimate for name, estimate in per_frame.items()},
         **{f"episode_{name}": estimate for name, estimate in per_episode.items()},

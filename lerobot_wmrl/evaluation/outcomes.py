@@ -12,6 +12,7 @@ from torch import Tensor
 from lerobot_wmrl.common.constants import KINDS, PLAY, START_KIND, START_TASK, TASK_NAMES
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.statistics import roc_auc
+from lerobot_wmrl.common.success_criterion import SuccessCriterion, first_run
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frame_cache import cached_features
 from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording, in_batches
@@ -124,12 +125,13 @@ class Outcomes:
         """Recorded success of each episode, (E,) bool."""
         return np.any(self.done, axis=1)
 
-    def first_predicted_success(self, threshold: float, frames: int) -> np.ndarray:
-        """Return the step at which the model first predicts success, −1 if never. (E,)
+    def first_predicted_success(self, criterion: SuccessCriterion) -> np.ndarray:
+        """Return the step at which the model first predicts success, −1 if never. (E,)"""
+        return criterion.first_met(self.padded_probability(criterion.frames))
 
-        As in the environment, `frames` consecutive frames must reach `threshold`; it is the first of them.
-        """
-        return first_run(self.padded_probability(frames) >= threshold, frames)
+    def predicted_success(self, criterion: SuccessCriterion) -> np.ndarray:
+        """Return whether the model predicts success for each episode, (E,) bool."""
+        return self.first_predicted_success(criterion) >= 0
 
     def cut_short(self, frames: int) -> np.ndarray:
         """Mark episodes that end with a success that has held for fewer than `frames` frames. (E,)"""
@@ -244,11 +246,3 @@ def by_task(outcomes: Outcomes, table: EpisodeTable) -> dict[str, Outcomes]:
     if not 1 < len(distinct) <= MOST_TASKS:
         return {}
     return {each: outcomes.where(instructions == each) for each in distinct}
-
-
-def first_run(fired: np.ndarray, frames: int) -> np.ndarray:
-    """Return where the first run of `frames` consecutive True begins, −1 if there is none. (E, T) → (E,)"""
-    if fired.shape[1] < frames:
-        return np.full(len(fired), -1)
-    runs = sliding_window_view(fired, frames, axis=1).min(-1)  # whether one begins there
-    return np.where(runs.max(1), runs.argmax(1), -1)

@@ -135,7 +135,7 @@ def save_sweep(gates: Sequence[Gate], path: Path) -> None:
     panels = {"false_positives": ("false positives (%)", 5), "recall": ("recall (%)", 90)}
     for axis, (name, (title, limit)) in zip(axes, panels.items(), strict=True):
         for frames in SWEEP_FRAMES:
-            shares = [100 * getattr(gate, name).share for gate in gates if gate.frames == frames]
+            shares = [100 * getattr(gate, name).share for gate in gates if gate.criterion.frames == frames]
             axis.plot(SWEEP_THRESHOLDS, shares, label=f"k = {frames}")
         axis.axhline(limit, color="black", linewidth=0.8, linestyle=":")
         axis.set_title(title, fontsize=10)

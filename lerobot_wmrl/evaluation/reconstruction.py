@@ -1,6 +1,7 @@
 """Reconstruction by a tokenizer: PSNR of recorded frames, camera by camera, and its use of the codes."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -108,8 +109,12 @@ def code_use(codebook: CodeBook, tokens: Tensor) -> dict[str, Any]:
     }
 
 
-def write_reconstruction(model: TokenizingModel, table: EpisodeTable, output_dir: Path) -> dict[str, Any]:
+def write_reconstruction(
+    model: TokenizingModel, table: EpisodeTable, output_dir: Path, chosen: Sequence[int] | None = None
+) -> dict[str, Any]:
     """Write `reconstruction.json`, unless it exists, for held-out episodes, or all if none is held out.
+
+    chosen: the episodes that were learnt from, all by default.
 
     Returns:
         What the file holds: split, and what `reconstruction_metrics` returns.
@@ -118,8 +123,9 @@ def write_reconstruction(model: TokenizingModel, table: EpisodeTable, output_dir
     if path.is_file():
         known: dict[str, Any] = json.loads(path.read_text())
         return known
-    split = "validation" if table.validation.any() else "all"
-    episodes = choose_episodes(table, split, MAX_FRAMES)
+    wanted = table.among(chosen)
+    split = "validation" if (table.validation & wanted).any() else "all"
+    episodes = choose_episodes(table, split, MAX_FRAMES, wanted=wanted)
     tokenizer_config = model.config.tokenizer
     frames = cached_frames(table.dataset, tokenizer_config.camera_keys, tokenizer_config.image_size)
     measured = {"split": split, **reconstruction_metrics(model.eval(), table, frames, episodes)}

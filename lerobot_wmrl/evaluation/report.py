@@ -12,6 +12,7 @@ from lerobot_wmrl.common.constants import KINDS, PLAY, START_KIND
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import markdown_table
 from lerobot_wmrl.common.statistics import Estimate, Proportion, evenly_spaced
+from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.evaluation import pictures
 from lerobot_wmrl.evaluation.accuracy import (
@@ -152,25 +153,25 @@ def evaluate(
 
 def report_action_model(
     model: ActionWorldModelRewardModel, recording: Recording, evaluation: ReplayEvaluation,
-    threshold: float, frames: int, folder: Path,
+    criterion: SuccessCriterion, folder: Path,
 ) -> Report:  # fmt: skip
     """Report accuracy, done, gate and robustness, and save their pictures in `folder`."""
     outcomes, horizon = evaluation.outcomes, recording.steps(HORIZON_SECONDS)
     taught = outcomes.as_taught(recording.table)
-    estimates = headline(evaluation.accuracy, horizon) | done_accuracy(taught, threshold, frames)
+    estimates = headline(evaluation.accuracy, horizon) | done_accuracy(taught, criterion)
     play = [
         e for e in evaluation.accuracy if recording.table.column(START_KIND)[e.episode] == KINDS.index(PLAY)
     ]
     steps, play_steps = by_step(evaluation.accuracy, horizon), by_step(play, COMPARED_FRAMES)
-    gates, tasks = sweep(outcomes), by_task(outcomes, recording.table)
-    at_task = {task: gate_at(task_outcomes, threshold, frames) for task, task_outcomes in tasks.items()}
+    gate, gates, tasks = gate_at(outcomes, criterion), sweep(outcomes), by_task(outcomes, recording.table)
+    at_task = {task: gate_at(task_outcomes, criterion) for task, task_outcomes in tasks.items()}
     best_at_task = {task: best_operating_point(sweep(task_outcomes)) for task, task_outcomes in tasks.items()}
     best = best_operating_point(gates)
-    extremes = robustness(model, recording, evaluation.attempts, threshold, frames)
+    extremes = robustness(model, recording, evaluation.attempts, criterion)
     seen = seen_outcomes(model, recording, outcomes.episodes)
-    seen_auc = math.nan if seen is None else seen.auc(frames)
+    seen_auc = math.nan if seen is None else seen.auc(criterion.frames)
     metrics = {
-        **gate_details(outcomes, threshold, frames),
+        **gate_details(outcomes, gate),
         **{name: estimates[name].as_json()["value"] if name in estimates else None for name in TOP_LEVEL},
         "horizon_frames": horizon,
         "headline": {name: estimate.as_json() for name, estimate in estimates.items()},
@@ -192,7 +193,7 @@ def report_action_model(
     pictures.save_comparisons(model, recording, evaluation.shown, folder)
     page = [
         headline_table(estimates),
-        gate_lines(gate_at(outcomes, threshold, frames), best),
+        gate_lines(gate, best),
         *([] if math.isnan(seen_auc) else [seen_line(seen_auc, LARGER)]),
         *([task_table(at_task, best_at_task)] if tasks else []),
         "False positives / recall, in percent:",
@@ -232,8 +233,7 @@ def headline_table(estimates: Mapping[str, Estimate]) -> str:
 def gate_lines(gate: Gate, best: Gate | None) -> str:
     """Describe the gate at the chosen operating point, and the best one."""
     lines = [
-        f"Gate at done_threshold={gate.threshold} and done_frames={gate.frames}: "
-        f"{'passed' if gate.passed else 'not passed'}.",
+        f"Gate at {gate.criterion}: {'passed' if gate.passed else 'not passed'}.",
         f"False positives (failures predicted as successes): {gate.false_positives}.",
         f"Recall (successes predicted as successes): {gate.recall}.",
     ]
@@ -243,19 +243,19 @@ def gate_lines(gate: Gate, best: Gate | None) -> str:
         )
     if gate.cut_short:
         lines.append(
-            f"{gate.cut_short} of the successes end before they have held for {gate.frames} frames. "
+            f"{gate.cut_short} of the successes end before they have held for {gate.criterion.frames} frames"
             + (
-                "As most do, the prediction for the last frame of every episode is repeated."
+                ". As most do, the prediction for the last frame of every episode is repeated."
                 if gate.repeats_last
-                else "They cannot be predicted; lower done_frames, or record on after success."
+                else ". They cannot be predicted; lower done_frames, or record on after success."
             )
         )
     if best is None:
         lines.append("No operating point has any recall with at most 5 % false positives.")
     else:
         lines.append(
-            f"Best with at most 5 % false positives: done_threshold={best.threshold} and "
-            f"done_frames={best.frames}; false positives {best.false_positives}; recall {best.recall}."
+            f"Best with at most 5 % false positives: {best.criterion}; "
+            f"false positives {best.false_positives}; recall {best.recall}."
         )
     return "\n".join(lines)
 
@@ -277,8 +277,7 @@ def task_table(gates: Mapping[str, Gate], best: Mapping[str, Gate | None]) -> st
         (
             task, gate.false_positives, gate.recall,
             "–" if math.isnan(gate.auc) else f"{gate.auc:.2f}", "yes" if gate.passed else "no",
-            "–" if not gate.recall.n or not gate.false_positives.n
-            else f"{point.threshold}, {point.frames}: {point.recall}" if (point := best[task]) else "none",
+            "–" if not gate.recall.n or not gate.false_positives.n else _best(best[task]),
         )
         for task, gate in gates.items()
     ]  # fmt: skip
@@ -296,9 +295,9 @@ def task_table(gates: Mapping[str, Gate], best: Mapping[str, Gate | None]) -> st
 
 def sweep_table(gates: Sequence[Gate]) -> str:
     """Tabulate false positives / recall in percent by threshold and frames."""
-    at = {(gate.threshold, gate.frames): gate for gate in gates}
+    at = {gate.criterion: gate for gate in gates}
     rows = [
-        (threshold, *(_percentages(at[threshold, frames]) for frames in SWEEP_FRAMES))
+        (threshold, *(_percentages(at[SuccessCriterion(threshold, frames)]) for frames in SWEEP_FRAMES))
         for threshold in SWEEP_THRESHOLDS
     ]
     return markdown_table(("threshold", *(f"k = {frames}" for frames in SWEEP_FRAMES)), rows)
@@ -341,6 +340,10 @@ def agreement_table(agreement: Agreement) -> str:
         verdict = f"No correlation: it takes {MIN_POLICIES} policies, of which some succeed more often."
     head = ["policy", "success in the world model", "success in `real_env`"]
     return f"{markdown_table(head, rows)}\n\n{verdict}"
+
+
+def _best(gate: Gate | None) -> str:
+    return f"{gate.criterion.threshold}, {gate.criterion.frames}: {gate.recall}" if gate else "none"
 
 
 def _percentages(gate: Gate) -> str:

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from lerobot_wmrl.common.images import to_pixels
+from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
-from lerobot_wmrl.evaluation.outcomes import first_run
 from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import general_reward, potential_discount
@@ -19,14 +19,13 @@ from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardM
 @torch.no_grad()
 def reward_along_episode(
     text_model: TextWorldModelRewardModel, reward: GeneralConfig, recording: Recording,
-    replay: EpisodeReplay, *, threshold: float, frames: int, longest: int,
+    replay: EpisodeReplay, *, criterion: SuccessCriterion, longest: int,
 ) -> dict[str, Any]:  # fmt: skip
     """Compute eqs. 5-8 for an episode: the similarity of recorded frames, and the success of imagined ones.
 
     Args:
         replay: the same episode, imagined with its own actions.
-        threshold: done probability that counts as done.
-        frames: consecutive frames for which it must be reached.
+        criterion: what counts as a predicted success.
         longest: frames after which the environment ends an episode, which decide its discount.
 
     Returns:
@@ -44,10 +43,10 @@ def reward_along_episode(
     goal_features = select_features(measure.features(goal.decoded), every, cameras)
     similarity = measure(measure.features(decoded), goal_features, cameras)
     probability = replay.done_probability[:-1]
-    (begin,) = first_run((probability >= threshold).cpu().numpy()[None], frames)
+    (begin,) = criterion.first_met(probability.cpu().numpy()[None])
     paid = torch.zeros_like(similarity[1:])
     if begin >= 0:
-        paid[begin + frames - 1] = 1
+        paid[begin + criterion.frames - 1] = 1
     earned = general_reward(
         paid, similarity[1:], similarity[:-1],
         alpha=reward.alpha, form=reward.form, gamma=potential_discount(reward, longest),

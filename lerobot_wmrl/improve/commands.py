@@ -71,9 +71,9 @@ def stages(progress: Progress) -> list[Stage]:
 
 def columns(plan: Plan) -> list[str]:
     root = plan.findings.root
-    names: Flags = {"operation.feature_names": plan.extra_columns}
-    command = edit_command(plan.out / "columns", "remove_feature", names)
-    return [*command, f"--repo_id=local/{root.name}", f"--root={root}"]
+    return edit_command(plan.out / "columns", "remove_feature", {
+        "repo_id": f"local/{root.name}", "root": str(root), "operation.feature_names": plan.extra_columns,
+    })  # fmt: skip
 
 
 def rollouts(plan: Plan) -> list[str]:

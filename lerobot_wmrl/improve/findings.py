@@ -47,6 +47,7 @@ class Findings:
         frame_side: the shorter side of their frames in pixels.
         pixels: pixels of all these cameras' frames.
         held_out: how many of them are held out from training.
+        held_out_tell: whether some of these succeed and some fail.
         tasks: how many tasks there are, as far as the dataset says.
         fewest: how many episodes there are of the task that has the fewest.
         longest: frames of the longest episode.
@@ -65,6 +66,7 @@ class Findings:
     frame_side: int
     pixels: int
     held_out: int
+    held_out_tell: bool
     tasks: int
     fewest: int
     longest: int
@@ -78,6 +80,11 @@ class Findings:
 
     def __str__(self) -> str:
         return "\n".join([*(f"  {line}" for line in self.lines), *(f"  ! {line}" for line in self.missing)])
+
+
+def tell_apart(success: np.ndarray) -> bool:
+    """Whether some episodes succeed and some fail, so that a world model can be asked which. (E,) bool"""
+    return bool(success.any() and not success.all())
 
 
 def require_mergeable(dataset: LeRobotDataset, env: WmrlManiSkillEnv) -> None:
@@ -137,7 +144,7 @@ def look(
         FieldError: the policy cannot be improved with it.
     """
     chosen = table.among(episodes)
-    held_out, total = int((table.validation & chosen).sum()), len(chosen)
+    held_out, total = table.success[table.validation & chosen], len(chosen)
     table = table.subset(chosen)
     features, success = table.dataset.features, table.success
     keys = [key for key in policy.image_features if key.startswith(OBS_IMAGE)]
@@ -164,7 +171,8 @@ def look(
         ],
         cameras=camera_names(keys),
         frame_side=min(map(min, sizes.values())), pixels=sum(h * w for h, w in sizes.values()),
-        held_out=held_out, tasks=len(tasks), fewest=int(tasks.min()), longest=int(table.length.max()),
+        held_out=len(held_out), held_out_tell=tell_apart(held_out),
+        tasks=len(tasks), fewest=int(tasks.min()), longest=int(table.length.max()),
         usual=usual_length(table),
         success_frames=int(table.length[success].sum()), failures=int((~success).sum()),
         root=Path(table.dataset.root), total=total,

@@ -12,7 +12,7 @@ from lerobot_wmrl.common.presets import Flags
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.start_frames import chosen_episodes
-from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, usual_length
+from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, tell_apart, usual_length
 from lerobot_wmrl.improve.plan import Plan
 
 ENOUGH_HELD_OUT: Final = 10
@@ -77,19 +77,20 @@ class LearntEpisodes:
         """Return the flags of the dataset that the world model is checked on, and its split.
 
         Held-out episodes are better than others, and rollouts better than the dataset: the policy that is
-        trained will act like them. But they must both succeed and fail.
+        trained will act like them. But they must both succeed and fail, if any do.
         """
         config, findings = self.plan.config, self.plan.findings
-        holds_out = findings.held_out >= ENOUGH_HELD_OUT
-        data = config.dataset.flags(), "validation" if holds_out else "all"
-        if config.rollouts < ENOUGH_HELD_OUT:
-            return data
-        table, numbers = self.table, list(self.plan.rollout_numbers())
-        success, validation = table.success[numbers], table.validation[numbers]
-        held_out = success[validation]
-        rollouts = replace(self.plan.data, episodes=numbers).flags()
-        if len(held_out) >= ENOUGH_HELD_OUT and held_out.any() and not held_out.all():
-            return rollouts, "validation"
-        if holds_out or success.all() or not success.any():
-            return data
-        return rollouts, "all"
+        dataset, holds_out = config.dataset.flags(), findings.held_out >= ENOUGH_HELD_OUT
+        choices = [
+            (holds_out and findings.held_out_tell, (dataset, "validation")),
+            (findings.failures > 0 and findings.success_frames > 0, (dataset, "all")),
+        ]
+        if config.rollouts >= ENOUGH_HELD_OUT:
+            table, numbers = self.table, list(self.plan.rollout_numbers())
+            success, validation = table.success[numbers], table.validation[numbers]
+            rollouts = replace(self.plan.data, episodes=numbers).flags()
+            enough = validation.sum() >= ENOUGH_HELD_OUT
+            choices.insert(0, (enough and tell_apart(success[validation]), (rollouts, "validation")))
+            choices.insert(2, (tell_apart(success), (rollouts, "all")))
+        unknown = dataset, "validation" if holds_out else "all"
+        return next((choice for possible, choice in choices if possible), unknown)

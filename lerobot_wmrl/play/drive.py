@@ -19,6 +19,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import jpeg, to_pixels
+from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.start_frames import StartImages
 from lerobot_wmrl.envs.world_model_env import Observation, WorldModels, WorldModelVectorEnv, make_env_at
@@ -152,11 +153,11 @@ class Drive:
             yield Step(before, np.clip(action[0].numpy(), box.low, box.high), self.measured["reward"])
         self.synchronized = True  # and the real environment has stayed where it was
 
-    def succeeds(self, threshold: float, frames: int) -> bool:
-        """Return whether the last `frames` frames are done, with a probability of at least `threshold`."""
-        last = self.views[1:][-frames:]
-        return len(last) == frames and all(
-            view["measured"].get("done_probability", 0.0) >= threshold for view in last
+    def succeeds(self, criterion: SuccessCriterion) -> bool:
+        """Return whether the criterion is met by the last frames."""
+        last = self.views[1:][-criterion.frames :]
+        return len(last) == criterion.frames and all(
+            view["measured"].get("done_probability", 0.0) >= criterion.threshold for view in last
         )
 
     def _catch_up(self) -> None:

@@ -108,7 +108,7 @@ class Visit:
     def _save(self, message: Mapping[str, Any]) -> dict[str, Any]:
         drive, success = self._driving(message), message.get("success")
         if success is None:
-            success = drive.succeeds(self.world.config.done_threshold, self.world.done_frames)
+            success = drive.succeeds(self.world.criterion)
         if not isinstance(success, bool):
             raise FieldError("success", success, "must be true or false")
         episode = self.saved.add(drive.replay(), drive.frame, drive.instruction, success)

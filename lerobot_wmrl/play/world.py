@@ -15,6 +15,7 @@ from torchvision.transforms.v2.functional import pil_to_tensor
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.common.policy_checks import fit_to_environment
+from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
@@ -48,8 +49,7 @@ class World:
     Args:
         models: the world models.
         config: configuration of the imagined episodes.
-        done_frames: consecutive done frames that make a success, by which an episode is judged even where it
-            does not end.
+        criterion: what makes a success; an episode is judged by it even where it does not end.
         table: table of the dataset in whose frames episodes can begin.
         policy: that can act.
         real_env: that takes the same actions, and whose resets episodes can begin in.
@@ -57,7 +57,7 @@ class World:
 
     models: WorldModels
     config: WorldModelEnv
-    done_frames: int
+    criterion: SuccessCriterion
     table: EpisodeTable | None = None
     policy: LoadedPolicy | None = None
     real_env: EnvConfig | None = None
@@ -90,7 +90,7 @@ class World:
             "axes": self.axes(),
             "state": self.model.embodiment.state_names if self.model.state_size else [],
             "clip_length": self.model.clip_length,
-            "done_threshold": self.config.done_threshold,
+            "done_threshold": self.criterion.threshold,
             "drivers": self.driver_names(),
             "policy": self.policy.config.type if self.policy else "",
             "episodes": episodes,
@@ -132,7 +132,7 @@ class World:
         policy = self.policy and copied(self.policy)
         if name == "policy" and policy is not None:
             return PolicyDriver(policy)
-        return PlannerDriver(planner_settings(self.model.clip_length), self.done_frames, policy)
+        return PlannerDriver(planner_settings(self.model.clip_length), self.criterion.frames, policy)
 
     def make_real_env(self) -> Any:
         """Return a visitor's own real environment, None if there is none."""
@@ -259,7 +259,7 @@ def load_world(
     """
     models = load_world_models(config, config.device)
     driven = config if end_at_success else replace(config, done_frames=config.horizon)
-    world = World(models, driven, config.done_frames)
+    world = World(models, driven, config.criterion)
     if isinstance(real_env, WmrlManiSkillEnv):
         if len(real_env.task_names) > 1:
             raise FieldError("real_env.task", real_env.task, "a drive needs a single task", "choose one")

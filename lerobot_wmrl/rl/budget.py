@@ -7,9 +7,9 @@ import numpy as np
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.errors import renamed, within
-from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.data.ledger import Ledger
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.start_frames import check_starts
 from lerobot_wmrl.maniskill.recordings import require_unmeasured, require_unreported

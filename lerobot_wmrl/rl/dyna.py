@@ -17,8 +17,8 @@ from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.precision import device_setting
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
-from lerobot_wmrl.data.budget import budget_flags
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
+from lerobot_wmrl.data.ledger import budget_flags
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, record_folder
 from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS, DynaConfig

@@ -77,7 +77,7 @@ class SuccessGate:
         verdicts = {}
         for source, recording in recordings.items():
             outcomes = predict_outcomes(self.env.model, recording).within(self.env.config.judged_frames)
-            verdicts[source] = gate_at(outcomes, self.env.config.done_threshold, self.env.config.done_frames)
+            verdicts[source] = gate_at(outcomes, self.env.config.criterion)
             save_strips(self.env, recording, outcomes, folder, source)
         shutil.rmtree(folder / "rollouts.cache", ignore_errors=True)
         steps = int(recordings[FRESH].table.length.sum()) if FRESH in recordings else 0
@@ -153,7 +153,7 @@ def save_strips(
     """Draw the shortest success and the shortest failure, a false positive if there is one, as frames: the
     recorded episode above, the imagined one below."""
     folder.mkdir(parents=True, exist_ok=True)
-    predicted = outcomes.first_predicted_success(env.config.done_threshold, env.config.done_frames) >= 0
+    predicted = outcomes.predicted_success(env.config.criterion)
     false_positives = predicted & ~outcomes.success
     failures = false_positives if false_positives.any() else ~outcomes.success
     for name, rows in {"success": outcomes.success, "failure": failures}.items():

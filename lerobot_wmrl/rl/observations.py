@@ -7,7 +7,7 @@ from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
 from lerobot_wmrl.common.constants import INSTRUCTIONS, Observation
-from lerobot_wmrl.common.images import to_bytes
+from lerobot_wmrl.common.images import from_bytes, to_bytes
 
 
 class ObservationBuffer:
@@ -58,7 +58,7 @@ class ObservationBuffer:
 def as_policy_input(stored: dict[str, Tensor], instructions: Sequence[str]) -> Observation:
     """Return stored observations as the policy sees them: images in [0, 1], instructions as texts."""
     return {
-        name: value.float() / 255 if name.startswith(OBS_IMAGE)
+        name: from_bytes(value) if name.startswith(OBS_IMAGE)
         else [instructions[index] for index in value.tolist()] if name == INSTRUCTIONS
         else value
         for name, value in stored.items()
@@ -78,6 +78,6 @@ def at_rows(observation: Observation, rows: Tensor) -> Observation:
 def as_read_back(observation: Observation) -> Observation:
     """Return the observation with images rounded to bytes, as an ObservationBuffer would return it."""
     return {
-        name: to_bytes(value).float() / 255 if name.startswith(OBS_IMAGE) else value
+        name: from_bytes(to_bytes(value)) if name.startswith(OBS_IMAGE) else value
         for name, value in observation.items()
     }

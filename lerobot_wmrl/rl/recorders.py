@@ -14,10 +14,10 @@ from lerobot_wmrl.common.lerobot_commands import env_flags
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
-from lerobot_wmrl.data.budget import ROLLOUTS, Ledger, budget_flags
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.embodiment import Embodiment
 from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.data.ledger import ROLLOUTS, Ledger, budget_flags
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.rollout_recorder import RolloutRecorder
 

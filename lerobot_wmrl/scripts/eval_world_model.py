@@ -29,6 +29,7 @@ from lerobot_wmrl.common.constants import DONE_FRAMES, DONE_THRESHOLD, EVALUATIO
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_probability
 from lerobot_wmrl.common.output_folders import Claim
 from lerobot_wmrl.common.presets import expand_preset, flag_as_typed
+from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
@@ -101,6 +102,11 @@ class EvalWorldModelConfig(RunConfig):
     device: str | None = None
     push_to_hub: bool = False
     output_dir: Path = Path("outputs/eval_world_model")
+
+    @property
+    def criterion(self) -> SuccessCriterion:
+        """What makes an imagined success."""
+        return SuccessCriterion(self.done_threshold, self.done_frames)
 
     def validate(self) -> None:
         """Raise FieldError for a setting that cannot be."""
@@ -176,9 +182,7 @@ def measure(
 
     recording = Recording.read(table, model)
     evaluation = evaluate(model, recording, episodes, cfg.episode_length)
-    reports = [
-        report_action_model(model, recording, evaluation, cfg.done_threshold, cfg.done_frames, cfg.output_dir)
-    ]
+    reports = [report_action_model(model, recording, evaluation, cfg.criterion, cfg.output_dir)]
     if text_model is not None:
         longest = cfg.episode_length or model.config.clip_length  # as the environment has it
         reports.append(report_text_model(cfg, text_model, recording, evaluation, longest))
@@ -357,7 +361,7 @@ def report_text_model(
     curves = {
         name: reward_along_episode(
             text_model, cfg.reward, recording, replay,
-            threshold=cfg.done_threshold, frames=cfg.done_frames, longest=longest,
+            criterion=cfg.criterion, longest=longest,
         )
         for name, replay in evaluation.shown.items()
     }  # fmt: skip

@@ -128,7 +128,7 @@ def check_data(cfg: TrainWorldModelConfig, table: EpisodeTable) -> None:
 
     These are episodes on which results are reported, and, with a budget, those that are not in its ledger.
     """
-    from lerobot_wmrl.data.budget import Ledger
+    from lerobot_wmrl.data.ledger import Ledger
     from lerobot_wmrl.maniskill.recordings import require_unreported
 
     def check_table(table: EpisodeTable, chosen: list[int] | None) -> None:
@@ -150,7 +150,8 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     from lerobot_wmrl.common.checkpoints import link_latest, newest_checkpoint, require_resumable
     from lerobot_wmrl.data.episodes import read_episodes
     from lerobot_wmrl.world_models.checkpoint import config_to_continue
-    from lerobot_wmrl.world_models.training import build_model, decide_on_instructions
+    from lerobot_wmrl.world_models.training import build_model
+    from lerobot_wmrl.world_models.training_data import decide_on_instructions
 
     path, settings = cfg.given["model"]
     if path:
@@ -204,7 +205,8 @@ def run_training(
     cfg: TrainWorldModelConfig, claim: Claim, model: Any, table: EpisodeTable, processes: PartialState
 ) -> None:
     """Cache the data, in the first process before the others, and train."""
-    from lerobot_wmrl.world_models.training import make_joint_sampler, train
+    from lerobot_wmrl.world_models.training import train
+    from lerobot_wmrl.world_models.training_data import make_joint_sampler
 
     with ExitStack() as held:
         with processes.main_process_first():
@@ -234,11 +236,11 @@ def quality(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> str:
     from lerobot_wmrl.world_models.training import held_out_metrics
 
     if isinstance(cfg.model, FrameTokenizerConfig):
-        measured = write_reconstruction(model, table, cfg.output_dir)
+        measured = write_reconstruction(model, table, cfg.output_dir, cfg.dataset.episodes)
         psnr = ", ".join(f"{camera} {value:.1f} dB" for camera, value in measured["psnr"].items())
         split = "held-out episodes" if measured["split"] == "validation" else "the episodes it was trained on"
         return f"PSNR on {split}: {psnr}."
-    measured = held_out_metrics(model, table, cfg.batch_size)
+    measured = held_out_metrics(model, table, cfg.batch_size, cfg.dataset.episodes)
     if measured:
         write_json(cfg.output_dir / HELD_OUT_FILE, measured)
     where = (

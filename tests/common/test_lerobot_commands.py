@@ -22,3 +22,12 @@ def test_advice_to_edit_a_dataset_is_a_whole_command(operation: str, setting: st
     assert (config.repo_id, str(config.root)) == ("local/my set", "data/my set")
     assert Path(config.new_root) == Path("data/my set_edited")
     assert getattr(config.operation, setting) == value
+
+
+def test_a_copy_of_a_dataset_in_the_hubs_cache_is_not_made_there(tmp_path: Path) -> None:
+    """It would be taken for a revision, and lost when the cache is cleaned."""
+    revision = tmp_path / "datasets--me--my_set" / "snapshots" / "0123abc"
+    _, *flags = shlex.split(edit_advice(revision, "remove_feature", {"operation.feature_names": ["x"]}))
+    config = draccus.parse(EditDatasetConfig, args=flags)
+    assert (str(config.root), config.repo_id) == (str(revision), "local/my_set")
+    assert Path(config.new_root) == Path("data/my_set_edited")

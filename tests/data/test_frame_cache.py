@@ -25,7 +25,7 @@ from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.autoregressive.depth import metres
 from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.training import make_joint_sampler
+from lerobot_wmrl.world_models.training_data import make_joint_sampler
 from tests.trained import action_config, run_training, text_config
 
 CAMERA = "observation.images.third_view"
@@ -176,7 +176,7 @@ def test_depth_beyond_the_farthest_is_named_and_compared_as_it_is_learnt(
     assert "of the depth is beyond" not in caplog.text
     depth = np.array(cached_depth(deep_dataset, [CAMERA], model.tokenizer.grid))
     depth[:, 3] = 4.0
-    for module in ("training", "imagination"):
+    for module in ("training_data", "imagination"):
         monkeypatch.setattr(f"lerobot_wmrl.world_models.{module}.cached_depth", lambda *_: depth)
     make_joint_sampler(model, table, TrainingData(str(deep_dataset.root)), batch_size=2, seed=0)
     assert "6 % of the depth is beyond 2.5 m" in caplog.text

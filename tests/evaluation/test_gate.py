@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.common.success_criterion import SuccessCriterion, first_run
 from lerobot_wmrl.data.episodes import solved_at_end
 from lerobot_wmrl.evaluation.gate import (
     Gate,
@@ -20,8 +21,10 @@ from lerobot_wmrl.evaluation.gate import (
     gate_details,
     sweep,
 )
-from lerobot_wmrl.evaluation.outcomes import Outcomes, by_task, first_run
+from lerobot_wmrl.evaluation.outcomes import Outcomes, by_task
 from lerobot_wmrl.evaluation.report import gate_lines, task_table
+
+CRITERION = SuccessCriterion(0.5, 3)
 
 
 @pytest.fixture
@@ -51,7 +54,7 @@ def test_the_first_run_is_of_consecutive_frames():
     (0.5, 3, 1, 2), (0.5, 1, 2, 2), (0.75, 3, 0, 2), (0.85, 3, 0, 1), (0.85, 4, 0, 1), (0.95, 1, 0, 0),
 ])  # fmt: skip
 def test_the_gate_counts_as_the_environment_ends_episodes(outcomes, threshold, frames, false, recognised):
-    gate = gate_at(outcomes, threshold, frames)
+    gate = gate_at(outcomes, SuccessCriterion(threshold, frames))
     assert (gate.false_positives.k, gate.false_positives.n) == (false, 2)
     assert (gate.recall.k, gate.recall.n) == (recognised, 3)
     assert not gate.passed
@@ -59,10 +62,15 @@ def test_the_gate_counts_as_the_environment_ends_episodes(outcomes, threshold, f
 
 def test_successes_that_end_too_early_are_counted(outcomes):
     """The third success holds for the last two of its four frames."""
-    assert [gate_at(outcomes, 0.5, frames).cut_short for frames in (1, 2, 3, 4)] == [0, 0, 1, 1]
-    lines = gate_lines(gate_at(outcomes, 0.5, 3), None)
+    assert [gate_at(outcomes, SuccessCriterion(0.5, frames)).cut_short for frames in (1, 2, 3, 4)] == [
+        0,
+        0,
+        1,
+        1,
+    ]
+    lines = gate_lines(gate_at(outcomes, CRITERION), None)
     assert "1 of the successes end before they have held for 3 frames. They cannot be predicted" in lines
-    assert "have held" not in gate_lines(gate_at(outcomes, 0.5, 2), None)
+    assert "have held" not in gate_lines(gate_at(outcomes, SuccessCriterion(0.5, 2)), None)
 
 
 def test_where_episodes_end_at_success_their_last_frames_count_as_lasting():
@@ -71,17 +79,17 @@ def test_where_episodes_end_at_success_their_last_frames_count_as_lasting():
     probability = np.array([[0.1, 0.1, 0.9, nan], [0.1, 0.1, 0.1, 0.9], [0.1, 0.9, 0.1, 0.1]])
     done = np.array([[False, False, True, False], [False] * 4, [False] * 4])
     at_success = Outcomes(np.arange(3), probability, done)
-    gate = gate_at(at_success, 0.5, 3)
+    gate = gate_at(at_success, CRITERION)
     assert (gate.recall.k, gate.false_positives.k) == (1, 1)
     assert "As most do, the prediction for the last frame" in gate_lines(gate, None)
     assert at_success.scores(3).tolist() == [0.9, 0.9, 0.1]
-    assert done_delay(at_success, 0.5, 3)[0] == 0
+    assert done_delay(at_success, CRITERION)[0] == 0
     parts = [at_success.where(np.array(kept)) for kept in ([True, False, True], [False, True, False])]
-    assert [gate_at(part, 0.5, 3).false_positives.k for part in parts] == [0, 1], (
+    assert [gate_at(part, CRITERION).false_positives.k for part in parts] == [0, 1], (
         "a part is judged as the whole"
     )
     seen_out = Outcomes(np.arange(3), np.nan_to_num(probability), done)
-    assert gate_at(seen_out, 0.5, 3).recall.k == 0
+    assert gate_at(seen_out, CRITERION).recall.k == 0
 
 
 @pytest.mark.parametrize(("held", "late"), [(3, 1), (3, 2), (5, 2)])
@@ -92,7 +100,7 @@ def test_a_success_that_is_seen_late_counts_although_its_episode_ends(held, late
     outcomes = Outcomes(
         np.arange(2), np.stack([probability, np.full(12, 0.1)]), np.stack([done, done & False])
     )
-    found = [gate_at(outcomes, 0.5, frames).recall.k for frames in range(1, 8)]
+    found = [gate_at(outcomes, SuccessCriterion(0.5, frames)).recall.k for frames in range(1, 8)]
     assert found == [1] * 7
 
 
@@ -102,7 +110,7 @@ def test_what_comes_later_than_an_imagined_episode_is_not_judged():
     done = np.array([[False, False, True], [True, True, True], [False] * 3])
     whole = Outcomes(np.arange(3), probability, done)
     for outcomes, failures, mistakes, found in ((whole, 1, 1, 2), (whole.within(2), 2, 0, 1)):
-        gate = gate_at(outcomes, 0.5, 1)
+        gate = gate_at(outcomes, SuccessCriterion(0.5, 1))
         assert (gate.false_positives.n, gate.false_positives.k) == (failures, mistakes)
         assert (gate.recall.n, gate.recall.k) == (3 - failures, found)
     assert whole.within(None).length.tolist() == [3, 3, 3]
@@ -120,9 +128,9 @@ def test_frames_are_scored_by_what_the_model_was_taught():
     probability = np.array([[0.1, 0.9, 0.9, 0.9], [0.1, 0.1, 0.1, np.nan]])
     outcomes = Outcomes(np.arange(2), probability, np.array([[False] * 3 + [True], [False] * 4]))
     taught = outcomes.as_taught(table)
-    quality = {name: each.value for name, each in done_accuracy(taught, 0.5, 3).items()}
+    quality = {name: each.value for name, each in done_accuracy(taught, CRITERION).items()}
     assert (quality["done_precision"], quality["done_recall"], quality["done_delay_frames"]) == (1, 1, 0)
-    assert done_accuracy(outcomes, 0.5, 3)["done_precision"].value == pytest.approx(1 / 3)
+    assert done_accuracy(outcomes, CRITERION)["done_precision"].value == pytest.approx(1 / 3)
     assert taught.held == outcomes.held == 1
 
 
@@ -137,9 +145,9 @@ def test_what_is_cut_where_imagination_ends_does_not_last():
         (3, 0),
         (2, 0),
     ):  # a success needs three frames, from the second on
-        gate = gate_at(whole.within(frames), 0.5, 3)
+        gate = gate_at(whole.within(frames), CRITERION)
         assert (gate.recall.k, gate.false_positives.k) == (recall, 0)
-    assert gate_at(whole.within(2).where(np.array([False, True])), 0.5, 3).false_positives.k == 0
+    assert gate_at(whole.within(2).where(np.array([False, True])), CRITERION).false_positives.k == 0
 
 
 @pytest.mark.parametrize("recorded", [4, 5])
@@ -152,7 +160,7 @@ def test_a_failure_that_looks_solved_when_imagination_ends_is_none(recorded):
     done = np.zeros((2, recorded), bool)
     done[0, 1] = True
     found = Outcomes(np.arange(2), probability, done).within(4)
-    gate = gate_at(found, 0.5, 3)
+    gate = gate_at(found, CRITERION)
     assert (gate.recall.k, gate.false_positives.k) == (1, 0)
     assert gate.auc == 1
 
@@ -163,7 +171,7 @@ def test_auc_is_the_share_of_pairs_in_the_right_order(outcomes):
     assert outcomes.auc(3) == pytest.approx((2 + 2 + 0.5) / 6)
     wins = Outcomes(np.arange(2), np.ones((2, 4)), np.ones((2, 4), bool))
     assert math.isnan(wins.auc(3))
-    assert not any("AUC" in line for line in gate_lines(gate_at(wins, 0.5, 3), None))
+    assert not any("AUC" in line for line in gate_lines(gate_at(wins, CRITERION), None))
     below = np.array([[-0.3, -0.2, np.nan], [-0.3, -0.2, -0.1]])
     labels = np.array([[False, True, False], [False] * 3])
     assert Outcomes(np.arange(2), below, labels).auc(1) == 0, "a shorter episode has no frame of 0"
@@ -173,12 +181,12 @@ def test_auc_is_the_share_of_pairs_in_the_right_order(outcomes):
 
 def test_the_best_operating_point_is_tolerable_and_recognises_most(outcomes):
     best = best_operating_point(sweep(outcomes))
-    assert (best.threshold, best.frames) == (0.8, 3)
+    assert best.criterion == SuccessCriterion(0.8, 3)
     assert (best.false_positives.k, best.recall.k) == (0, 2)
     believed = Outcomes(outcomes.episodes, np.ones((5, 6)), outcomes.done)
     assert best_operating_point(sweep(believed)) is None
     knowing = Outcomes(outcomes.episodes, outcomes.done.astype(float), outcomes.done)
-    assert gate_at(knowing, 0.5, 2).passed
+    assert gate_at(knowing, SuccessCriterion(0.5, 2)).passed
 
 
 def test_successes_alone_have_an_operating_point_too(outcomes):
@@ -189,7 +197,7 @@ def test_successes_alone_have_an_operating_point_too(outcomes):
 
 
 def test_verdicts_of_every_episode_are_reported_as_json(outcomes):
-    agreement = json.loads(json.dumps(gate_details(outcomes, 0.5, 3)))
+    agreement = json.loads(json.dumps(gate_details(outcomes, gate_at(outcomes, CRITERION))))
     assert agreement["predicted_success"] == [True, True, False, True, False]
     assert agreement["recorded_success"] == [True, True, True, False, False]
     assert (agreement["failures"], agreement["true_positives"]) == (2, 2)
@@ -197,14 +205,14 @@ def test_verdicts_of_every_episode_are_reported_as_json(outcomes):
 
 def test_done_by_frame_by_episode_and_how_late(outcomes):
     """By frame: 5 + 3 of 5 + 5 + 2 true ones called, and 3 + 1 false ones."""
-    quality = {name: estimate.value for name, estimate in done_accuracy(outcomes, 0.5, 3).items()}
+    quality = {name: estimate.value for name, estimate in done_accuracy(outcomes, CRITERION).items()}
     assert quality["done_precision"] == pytest.approx(8 / 12)
     assert quality["done_recall"] == pytest.approx(8 / 12)
     assert quality["done_f1"] == pytest.approx(8 / 12)
     assert quality["episode_precision"] == pytest.approx(2 / 3)
     assert quality["episode_recall"] == pytest.approx(2 / 3)
     assert quality["done_delay_frames"] == pytest.approx((0 + 2) / 2)
-    assert np.isnan(done_delay(outcomes, 0.5, 3)[2:]).all()
+    assert np.isnan(done_delay(outcomes, CRITERION)[2:]).all()
 
 
 def test_done_is_scored_without_a_threshold_too():
@@ -219,23 +227,23 @@ def test_done_is_scored_without_a_threshold_too():
 
 def test_early_and_late_calls_do_not_cancel(outcomes):
     outcomes.done[0, 1] = False
-    quality = {name: estimate.value for name, estimate in done_accuracy(outcomes, 0.5, 3).items()}
+    quality = {name: estimate.value for name, estimate in done_accuracy(outcomes, CRITERION).items()}
     assert quality["done_delay_frames"] == pytest.approx((-1 + 2) / 2)
     assert quality["done_distance_frames"] == pytest.approx((1 + 2) / 2)
 
 
 def test_without_any_success_rates_are_no_numbers():
     never = Outcomes(np.arange(3), np.zeros((3, 4)), np.zeros((3, 4), bool))
-    assert math.isnan(done_accuracy(never, 0.5, 3)["done_f1"].value)
-    assert gate_details(never, 0.5, 3)["recall"]["share"] is None
-    assert not gate_at(never, 0.5, 3).passed
+    assert math.isnan(done_accuracy(never, CRITERION)["done_f1"].value)
+    assert gate_details(never, gate_at(never, CRITERION))["recall"]["share"] is None
+    assert not gate_at(never, CRITERION).passed
 
 
 def test_every_task_has_a_gate_of_its_own(outcomes):
     columns = {"start.task": np.array([0, 0, 1, 1, -1])}
     table: Any = SimpleNamespace(column=columns.__getitem__)
     tasks = by_task(outcomes, table)
-    gates = {task: gate_at(own, 0.5, 3) for task, own in tasks.items()}
+    gates = {task: gate_at(own, CRITERION) for task, own in tasks.items()}
     assert list(gates) == ["push", "pull"]
     assert (gates["push"].recall.k, gates["push"].recall.n, gates["push"].false_positives.n) == (
         2,
@@ -263,7 +271,7 @@ def test_tasks_of_own_data_are_told_by_their_instructions(outcomes):
 
 def gate_of(false: int, failures: int, recognised: int, successes: int) -> Gate:
     return Gate(
-        threshold=0.5, frames=2, false_positives=Proportion(false, failures),
+        criterion=SuccessCriterion(0.5, 2), false_positives=Proportion(false, failures),
         recall=Proportion(recognised, successes), cut_short=0, repeats_last=False, auc=0.9,
     )  # fmt: skip
 

@@ -12,6 +12,7 @@ import torch
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
 from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
 from lerobot_wmrl.data.frames import NO_CONTEXT
@@ -67,7 +68,7 @@ def test_a_perfect_model_reaches_the_ceiling_and_passes_the_gate(source, model):
     assert (measured.steps["token_accuracy"] == 1).all()
     assert (measured.steps["tcp_error_mm"] == 0).all()
     np.testing.assert_allclose(measured.steps["tokenizer_lpips"], 0, atol=1e-6)
-    gate = gate_at(Outcomes.stack(runs), 0.5, 3)
+    gate = gate_at(Outcomes.stack(runs), SuccessCriterion(0.5, 3))
     assert gate.passed
     assert (gate.false_positives.n, gate.recall.n) == (2, 4)
 
@@ -144,7 +145,7 @@ def test_extreme_actions_are_what_they_are_called(source, model):
     assert torch.equal(targets["frozen"], own[:, :1].expand_as(own))
     torch.testing.assert_close(targets["reversed"] - targets["frozen"], targets["frozen"] - own)
     assert list(extreme_actions(own, low, high, absolute=None)) == ["saturated"]
-    result = robustness(model, source, np.arange(6), threshold=1e-9, frames=1)
+    result = robustness(model, source, np.arange(6), SuccessCriterion(1e-9, 1))
     assert result.predicted_success["frozen"].share == 1
 
 
@@ -198,7 +199,7 @@ def test_frames_of_long_episodes_are_compared_in_part_and_outcomes_as_a_whole(so
 
 
 def test_the_gate_is_one_call(small_dataset, model):
-    gate = success_gate(model, Path(small_dataset.root), threshold=1e-9, frames=1)
+    gate = success_gate(model, Path(small_dataset.root), SuccessCriterion(1e-9, 1))
     assert (gate.false_positives.share, gate.recall.share) == (1, 1)
 
 
@@ -208,13 +209,13 @@ def test_an_episode_that_ends_without_success_is_a_failure(small_dataset, model,
     ends = np.isin(np.arange(len(table.done)), table.start + table.length - 1)
     root = relabelled(Path(small_dataset.root), tmp_path / "ends", {"next.done": ends.tolist()})
     assert read_episodes(open_dataset(root)).done.tolist() == table.done.tolist()
-    gate = success_gate(model, root)
+    gate = success_gate(model, root, SuccessCriterion())
     assert (gate.false_positives.n, gate.recall.n) == (2, 4)
     root = relabelled(Path(small_dataset.root), tmp_path / "old", {"next.success": None})
     assert read_episodes(open_dataset(root)).done.tolist() == table.done.tolist()
     root = relabelled(Path(small_dataset.root), tmp_path / "unlabelled", UNLABELLED)
     with pytest.raises(ValueError, match=r"neither next\.success nor next\.done"):
-        success_gate(model, root)
+        success_gate(model, root, SuccessCriterion())
 
 
 def test_episodes_of_which_nobody_knows_the_outcome_are_no_failures(small_dataset, trained_models, tmp_path):
@@ -237,7 +238,7 @@ def test_success_is_paid_once_in_the_frame_that_completes_it(source, model, trai
     probability[[0, 3]] = 0.0  # the first run has two frames
     found = reward_along_episode(
         text_model, GeneralConfig(device="cpu", alpha=1.0), source,
-        replace(replay, done_probability=probability), threshold=0.5, frames=frames, longest=8,
+        replace(replay, done_probability=probability), criterion=SuccessCriterion(0.5, frames), longest=8,
     )  # fmt: skip
     count = len(probability) - 1
     assert found["return"] == [0.0] * 6 + [1.0] * (count - 6)
@@ -245,7 +246,8 @@ def test_success_is_paid_once_in_the_frame_that_completes_it(source, model, trai
     returns = [
         reward_along_episode(
             text_model, GeneralConfig(device="cpu", alpha=0.9), source,
-            replace(replay, done_probability=probability), threshold=0.5, frames=frames, longest=longest,
+            replace(replay, done_probability=probability),
+            criterion=SuccessCriterion(0.5, frames), longest=longest,
         )["return"][-1]
         for longest in (2, 200)
     ]  # fmt: skip

@@ -10,8 +10,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from experiments.budget import Source, simple_commands, sources
 from experiments.run import StudyError, run_study
 from experiments.study import Step, Study, read_cells
-from lerobot_wmrl.data.budget import Ledger, Limits
 from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.data.ledger import Ledger, Limits
 
 HEAD = """
 question: Is it fair?

@@ -7,6 +7,7 @@ import pytest
 
 from experiments.told import other_instructions, outcomes_with, told
 from lerobot_wmrl.common.constants import TASK_NAMES
+from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.evaluation.outcomes import seen_outcomes
 from lerobot_wmrl.evaluation.replay import Recording
@@ -34,14 +35,14 @@ def test_frames_are_judged_as_the_gate_judges_them_and_under_another_instruction
     np.testing.assert_allclose(own.probability[:, :length], expected.probability[:, :length], atol=1e-5)
     other = outcomes_with(model, table, other_instructions(np.arange(6) % 2, table.instructions))
     assert not np.allclose(own.probability, other.probability, atol=1e-3, equal_nan=True)
-    everything = told(model, table, threshold=0.0, frames=1)
+    everything = told(model, table, criterion=SuccessCriterion(0.0, 1))
     assert [*everything] == [TASK_NAMES[0], TASK_NAMES[1]]
     for task, found in enumerate(everything.values()):
         successes = int(table.success[task::2].sum())
         assert found["recall"]["k"] == found["recall"]["n"] == successes
         assert found["under_another_instruction"]["k"] == successes
         assert found["false_positive_rate"]["n"] == 3 - successes
-    nothing = told(model, table, threshold=1.1, frames=1)
+    nothing = told(model, table, criterion=SuccessCriterion(1.1, 1))
     assert {found["under_another_instruction"]["n"] for found in nothing.values()} == {0}
 
 

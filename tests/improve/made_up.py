@@ -20,8 +20,9 @@ def improvement_of(
     """Return one with data of which this was found: 40 short episodes unless something else is said."""
     policy = policy or CnnConfig(device="cpu", pretrained_path=folder)
     data = {
-        "cameras": ["top"], "frame_side": 96, "pixels": 96**2, "held_out": 2, "tasks": 1, "fewest": 40,
-        "longest": 40, "usual": 40, "success_frames": 1000, "failures": 0, "total": 40, "held": 2,
+        "cameras": ["top"], "frame_side": 96, "pixels": 96**2, "held_out": 2, "held_out_tell": False,
+        "tasks": 1, "fewest": 40, "longest": 40, "usual": 40, "success_frames": 1000, "failures": 0,
+        "total": 40, "held": 2,
     }  # fmt: skip
     config = ImproveConfig(policy=policy, dataset=ChosenEpisodes("data"), size=size, output_dir=folder)
     found = {**data, "root": Path("data"), "columns": {}, **found}

@@ -13,6 +13,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig, PushtEnv
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
+from lerobot.scripts.lerobot_edit_dataset import EditDatasetConfig
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_wmrl.common.checkpoints import link_checkpoint
@@ -161,13 +162,26 @@ def test_the_check_takes_held_out_episodes_where_there_are_enough(
     assert f"--split={split}" in made_commands(tmp_path, held_out=held_out)["check"]
 
 
+@pytest.mark.parametrize(("failures", "tell", "split"), [(19, False, "all"), (19, True, "validation")])
+def test_the_check_takes_failures_wherever_they_are(
+    tmp_path: Path, failures: int, tell: bool, split: str
+) -> None:
+    """Successes alone say nothing of false positives."""
+    found = {"held_out": 10, "held_out_tell": tell, "failures": failures}
+    assert improvement_of(tmp_path, **found).learnt.checked() == ({"dataset.root": "data"}, split)
+
+
 BOTH, EARLY, NEITHER = "both outcomes", "both, but held-out successes alone", "successes alone"
+
+ALIKE = 11
+"""Held-out episodes of a dataset that all succeed."""
 
 
 @pytest.mark.parametrize(("rollouts", "outcomes", "held_out", "root", "split"), [
     (9, BOTH, 2, "data", "all"), (10, BOTH, 2, "rollouts", "all"), (10, BOTH, 10, "data", "validation"),
     (200, BOTH, 10, "rollouts", "validation"), (200, EARLY, 2, "rollouts", "all"),
     (200, EARLY, 10, "data", "validation"), (200, NEITHER, 2, "data", "all"),
+    (100, EARLY, ALIKE, "rollouts", "all"), (200, NEITHER, ALIKE, "data", "validation"),
 ])  # fmt: skip
 def test_rollouts_are_checked_on_if_they_tell_more_than_the_dataset(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rollouts: int, outcomes: str, held_out: int, root: str,
@@ -181,7 +195,7 @@ def test_rollouts_are_checked_on_if_they_tell_more_than_the_dataset(
     )
     monkeypatch.setattr(learnt, "read_episodes", lambda dataset: table)
     monkeypatch.setattr(ChosenEpisodes, "open", lambda self: self.root)
-    improvement = improvement_of(tmp_path, held_out=held_out)
+    improvement = improvement_of(tmp_path, held_out=held_out, held_out_tell=held_out == 10)
     improvement.plan.config.rollouts, improvement.plan.config.real_env = rollouts, PushtEnv()
     merged = {"dataset.root": str(tmp_path / "merged"), "dataset.episodes": [*range(40, 40 + rollouts)]}
     wanted = {"data": {"dataset.root": "data"}, "rollouts": merged}[root]
@@ -236,6 +250,15 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
     assert measured <= {*made["rl"]}
     assert "checkpoints/best/" in ppo
     assert "checkpoints/last/" in distilled
+
+
+def test_lerobot_edits_the_dataset_in_a_folder_with_any_name(tmp_path: Path) -> None:
+    """2024_01_15 is a number in YAML, by which LeRobot reads what is not quoted."""
+    numbers = dict.fromkeys(("observation.state", "action", "effort"), "float32")
+    improvement = improvement_of(tmp_path, root=Path("2024_01_15"), columns=numbers)
+    improvement.plan.config.rollouts, improvement.plan.config.real_env = 20, PushtEnv()
+    config = draccus.parse(EditDatasetConfig, args=commands.columns(improvement.plan)[1:])
+    assert (config.root, config.operation.feature_names) == ("2024_01_15", ["effort"])
 
 
 @pytest.mark.parametrize(("real", "rollouts", "longest", "discount"), [

@@ -14,9 +14,9 @@ from lerobot_dataset_maniskill.recorder import record
 from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import read_policy_config
-from lerobot_wmrl.data.budget import Ledger, Limits
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.data.ledger import Ledger, Limits
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig

@@ -25,10 +25,10 @@ from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED, START_SEED
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.images import to_pixels
 from lerobot_wmrl.common.policies import read_policy_config
-from lerobot_wmrl.data.budget import Ledger, Limits
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
-from lerobot_wmrl.data.features import matched
+from lerobot_wmrl.data.features import matched, row_in
+from lerobot_wmrl.data.ledger import Ledger, Limits
 from lerobot_wmrl.envs.rollout_recorder import RolloutRecorder
 from tests.pusht import record_pusht
 from tests.rl.checkpoints import save_untrained_policy
@@ -110,6 +110,29 @@ def test_videos_are_encoded_as_those_of_the_dataset(
     record(config)
     merge_folders([videos.root, config.root], tmp_path / "merged", "local/merged")
     assert len(read_episodes(open_dataset(tmp_path / "merged")).length) == 4
+
+
+def test_numbers_are_recorded_in_the_types_of_the_dataset(
+    config: RecordConfig, demonstrations: Path, tmp_path: Path
+) -> None:
+    """Actions in double precision, labels as whole numbers: LeRobot merges no datasets of other types."""
+    given = open_dataset(demonstrations)
+    own = {name: dict(each) for name, each in given.features.items() if name not in DEFAULT_FEATURES}
+    own["action"]["dtype"], own["next.success"]["dtype"] = "float64", "int64"
+    precise = LeRobotDataset.create("local/precise", given.fps, own, root=tmp_path / "precise")
+    for row in range(2):
+        frame = {name: value.numpy() for name, value in given[row].items() if name in own}
+        frame |= {name: value.reshape(1) for name, value in frame.items() if name.startswith("next.")}
+        frame[OBS_IMAGE] = np.moveaxis(frame[OBS_IMAGE], 0, -1)
+        precise.add_frame(row_in(own, frame) | {"task": given[row]["task"]})
+    precise.save_episode()
+    precise.finalize()
+    config.like = DatasetSource(str(precise.root))
+    record(config)
+    merge_folders([precise.root, config.root], tmp_path / "merged", "local/merged")
+    merged = open_dataset(tmp_path / "merged")
+    assert len(read_episodes(merged).length) == 4
+    assert [merged.features[name]["dtype"] for name in ("action", "next.success")] == ["float64", "int64"]
 
 
 def test_a_dataset_of_another_rate_is_refused(
@@ -312,6 +335,6 @@ def test_columns_that_a_rollout_lacks_are_named(
         record(config)
     with pytest.raises(ValueError, match=r"third_view: the dataset has it as images of .* has none"):
         matched({"action": {"dtype": "float32", "shape": (7,)}}, panda.meta.features)
-    precise = {"action": {"dtype": "float64", "shape": (2,)}}
-    with pytest.raises(ValueError, match=r"action: the dataset has it as float64 .*, a rollout has float32"):
-        matched({"action": {"dtype": "float32", "shape": (2,)}}, precise)
+    whole = {"action": {"dtype": "int64", "shape": (2,)}}
+    with pytest.raises(ValueError, match=r"action: the dataset has it as int64 .*, a rollout has float32"):
+        matched({"action": {"dtype": "float32", "shape": (2,)}}, whole)

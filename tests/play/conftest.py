@@ -59,7 +59,7 @@ def world(make_world) -> World:
 @pytest.fixture
 def saved(world, tmp_path) -> SavedEpisodes:
     """A place for episodes."""
-    return SavedEpisodes(tmp_path / "driven", world.model.embodiment, world.done_frames)
+    return SavedEpisodes(tmp_path / "driven", world.model.embodiment, world.criterion.frames)
 
 
 class Served:

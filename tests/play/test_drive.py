@@ -342,7 +342,7 @@ def test_an_error_midway_loses_nothing(drive, act, at, monkeypatch):
 def test_success_is_judged_by_the_last_frames_where_the_episode_goes_on(make_world, saved):
     """And labelled in them alone."""
     world = make_world(done_frames=2)
-    visit = Visit(world, type(saved)(saved.folder, saved.robot, world.done_frames))
+    visit = Visit(world, type(saved)(saved.folder, saved.robot, world.criterion.frames))
     visit.answer({"do": "begin", "episode": 0, "frame": 0})
     step = world.models.model.step
     logits = iter([-20.0, -20.0, 20.0, 20.0, 20.0])

@@ -18,6 +18,7 @@ from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.lerobot_commands import env_flags
 from lerobot_wmrl.common.presets import format_flags
 from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -62,7 +63,7 @@ def test_a_verdict_is_the_evaluations_own(
     gate = make_gate(BELIEVES_ALL)
     found = gate.run(0, tmp_path, tmp_path / "gate")
     outcomes = predict_outcomes(env.model, labelled_recording(env.model, read_episodes(small_dataset)))
-    assert found["labelled"] == gate_at(outcomes, BELIEVES_ALL, 2).as_json()
+    assert found["labelled"] == gate_at(outcomes, SuccessCriterion(BELIEVES_ALL, 2)).as_json()
     assert found["labelled"]["false_positive_rate"]["share"] == 1.0
     assert found["failed"]
     assert found["real_steps"] == 0
@@ -197,8 +198,8 @@ def test_either_source_of_rollouts_fails_the_world_model(
 
     def verdict(*_: Any) -> Gate:
         return Gate(
-            threshold=0.5, frames=1, false_positives=Proportion(next(found), 10), recall=Proportion(1, 1),
-            cut_short=0, repeats_last=False, auc=1.0,
+            criterion=SuccessCriterion(0.5, 1), false_positives=Proportion(next(found), 10),
+            recall=Proportion(1, 1), cut_short=0, repeats_last=False, auc=1.0,
         )  # fmt: skip
 
     monkeypatch.setattr("lerobot_wmrl.rl.gate.gate_at", verdict)

@@ -11,8 +11,8 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.budget import Ledger, Limits
 from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.data.ledger import Ledger, Limits
 from lerobot_wmrl.maniskill.scenes import scenes_of
 from lerobot_wmrl.rl import dyna, recorders
 from lerobot_wmrl.rl.budget import check_data

@@ -21,7 +21,7 @@ from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_wor
 from lerobot_wmrl.world_models.autoencoder import Fusion
 from lerobot_wmrl.world_models.checkpoint import load_model, read_config
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
-from lerobot_wmrl.world_models.training import make_sampler
+from lerobot_wmrl.world_models.training_data import make_sampler
 from tests.trained import action_config, run_training, small_tokenizer, text_config, tokenizer_config
 
 CAMERA = "observation.images.third_view"

@@ -17,7 +17,8 @@ from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import cosine_schedule
-from lerobot_wmrl.world_models.training import build_model, make_joint_sampler
+from lerobot_wmrl.world_models.training import build_model
+from lerobot_wmrl.world_models.training_data import make_joint_sampler
 from tests.torchrun import torchrun
 
 SCRIPT = Path(__file__).with_name("trainings.py")

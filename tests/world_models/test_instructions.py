@@ -25,7 +25,7 @@ from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerCon
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
 from lerobot_wmrl.world_models.success import SuccessClassifier
 from lerobot_wmrl.world_models.text import ByteTextEncoder
-from lerobot_wmrl.world_models.training import decide_on_instructions, make_sampler
+from lerobot_wmrl.world_models.training_data import decide_on_instructions, make_sampler
 from tests.trained import (
     CLIP_LENGTH,
     PULL,

@@ -22,7 +22,7 @@ from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerCon
 from lerobot_wmrl.world_models.losses import feature_loss
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import FrameTokenizerRewardModel
 from lerobot_wmrl.world_models.success import SuccessClassifier, augment
-from lerobot_wmrl.world_models.training import make_sampler
+from lerobot_wmrl.world_models.training_data import make_sampler
 from tests.relabelled import UNLABELLED, relabelled
 from tests.trained import action_config, run_training, text_config, tokenizer_config
 

@@ -26,13 +26,8 @@ from lerobot_wmrl.world_models.anchored import dynamics as anchored
 from lerobot_wmrl.world_models.autoregressive import dynamics as autoregressive
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.layers import ClipMemory
-from lerobot_wmrl.world_models.training import (
-    golden_episodes,
-    held_out_metrics,
-    make_joint_sampler,
-    make_sampler,
-    optimizer_step,
-)
+from lerobot_wmrl.world_models.training import held_out_metrics, optimizer_step
+from lerobot_wmrl.world_models.training_data import golden_episodes, make_joint_sampler, make_sampler
 from tests.relabelled import UNLABELLED, relabelled
 from tests.trained import action_config, run_training, text_config, tokenizer_config, train_tokenizer
 

@@ -13,9 +13,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.common.constants import KINDS, START_KIND
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.budget import IMAGINED, ROLLOUTS, Ledger, Limits, episode_digests, spending
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
+from lerobot_wmrl.data.ledger import IMAGINED, ROLLOUTS, Ledger, Limits, episode_digests, spending
 
 LIMITS = Limits(demonstrations=6, rollouts=10)
 

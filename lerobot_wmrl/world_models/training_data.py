@@ -1,0 +1,233 @@
+"""What a tokenizer or a world model learns from: its episodes, and the clips that are drawn of them."""
+
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from lerobot.configs.rewards import RewardModelConfig
+from lerobot.rewards.pretrained import PreTrainedRewardModel
+
+from lerobot_wmrl.common.constants import HUMAN_LIKE, KINDS, START_KIND
+from lerobot_wmrl.common.errors import FieldError, renamed
+from lerobot_wmrl.data.checks import require_shown, solved_from_the_start
+from lerobot_wmrl.data.clips import ClipSampler, FrameSampler, InTurn
+from lerobot_wmrl.data.dataset import TrainingData
+from lerobot_wmrl.data.episodes import EpisodeTable, count_tasks
+from lerobot_wmrl.data.frame_cache import (
+    FAR,
+    cached_context,
+    cached_depth,
+    cached_features,
+    cached_frames,
+    cached_tokens,
+)
+from lerobot_wmrl.world_models.checkpoint import check_dataset
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
+from lerobot_wmrl.world_models.text import instruction_problem
+
+FAR_SHARE: Final = 0.05
+"""Share of the depth that may be beyond `FAR` without a warning."""
+
+
+def decide_on_instructions(config: RewardModelConfig, table: EpisodeTable, data: TrainingData) -> None:
+    """Say in a new tokenizer's configuration whether success depends on the instruction, unless it says so.
+
+    It does where the episodes that are learnt from are of several tasks, and all instructions can be read.
+
+    Raises:
+        FieldError: it is asked for, and an instruction cannot be read.
+    """
+    if not isinstance(config, FrameTokenizerConfig) or not config.tokenizer.success or config.pretrained_path:
+        return
+    asked = config.tokenizer.instructions
+    tables = [table.subset(table.training(data.episodes))]
+    tables += [each.subset(each.training(None)) for each in data.read_more()]
+    reads = count_tasks(tables) > 1 if asked is None else asked
+    problem = reads and instruction_problem(text for each in tables for text in each.instructions)
+    if problem and asked:
+        raise FieldError(
+            "tokenizer.instructions", True, problem,
+            "or set it to false: success then depends on pictures alone",
+        )  # fmt: skip
+    if problem:
+        logging.warning("success is told without the instructions, one of which cannot be read: %s", problem)
+    config.tokenizer = replace(config.tokenizer, instructions=reads and not problem)
+
+
+def require_golden(table: EpisodeTable, episodes: np.ndarray) -> np.ndarray:
+    """Return the episodes (E,) that a text world model learns from. FieldError if there is none."""
+    if episodes.any():
+        return episodes
+    raise FieldError(
+        "dataset.root", table.dataset.root, "has no successful demonstration",
+        "the text world model needs some: record them, or add labels (lerobot-wmrl-label)",
+    )  # fmt: skip
+
+
+def golden_episodes(table: EpisodeTable) -> np.ndarray:
+    """Mark the episodes that the text world model learns from. (E,)
+
+    They are successful demonstrations, or all successes of a dataset that does not say who acted.
+    """
+    kind = table.column(START_KIND)
+    return table.success & np.isin(kind, (-1, KINDS.index("optimal"), KINDS.index(HUMAN_LIKE)))
+
+
+def make_sampler(
+    model: PreTrainedRewardModel,
+    table: EpisodeTable,
+    chosen: Sequence[int] | None,
+    batch_size: int,
+    seed: int,
+) -> ClipSampler | FrameSampler:
+    """Make the sampler of training batches for this kind of model.
+
+    Args:
+        model: a frame tokenizer or a world model.
+        table: the dataset.
+        chosen: indices of episodes to learn from, all by default; held-out episodes are left out.
+        batch_size: frames (tokenizer) or clips (world models) a batch.
+        seed: seed of the draws.
+
+    Raises:
+        FieldError: there is no episode to learn from.
+    """
+    episodes = table.training(chosen)
+    if not episodes.any():
+        raise FieldError(
+            "dataset.root", table.dataset.root, "has no episode to train on",
+            "record some first, or choose others with `dataset.episodes`: every twentieth is held out",
+        )  # fmt: skip
+    config: Any = model.config
+    if model.name == "frame_tokenizer":
+        if config.tokenizer.success and not table.has_labels:
+            raise FieldError(
+                "tokenizer.success", True,
+                f"{table.dataset.root} has neither next.success nor next.done, so its frames cannot be told "
+                "apart", "label its episodes, or leave `tokenizer.success` out",
+            )  # fmt: skip
+        if config.tokenizer.success and table.success[episodes].any():
+            require_shown(table, episodes.nonzero()[0])
+        tokenizer_config = config.tokenizer
+        frames, cameras = (
+            cached_frames(table.dataset, tokenizer_config.camera_keys, tokenizer_config.image_size),
+            tokenizer_config.cameras,
+        )
+        return FrameSampler(table, frames, episodes.nonzero()[0], cameras, batch_size, seed, config.device)
+    if isinstance(config, TextWorldModelConfig):
+        episodes = require_golden(table, episodes & golden_episodes(table))
+    elif not table.has_labels:
+        logging.warning(
+            "dataset.root=%s: has neither next.success nor next.done: the model cannot learn from it what "
+            "success is. Check it afterwards (lerobot-wmrl-eval-world-model)",
+            table.dataset.root,
+        )
+    return make_clip_sampler(model, table, episodes.nonzero()[0], batch_size, seed)
+
+
+def make_clip_sampler(
+    model: Any, table: EpisodeTable, episodes: np.ndarray, batch_size: int, seed: int
+) -> ClipSampler:
+    """Make a sampler of clips from these episodes, with what else the model looks at or predicts."""
+    config, tokenizer, dataset = model.config, model.tokenizer, table.dataset
+    chosen = table.subset(episodes)
+    if config.reads_instructions and (problem := instruction_problem(chosen.instructions)):
+        raise FieldError(
+            "dataset.root", dataset.root, problem,
+            "or train a tokenizer with `tokenizer.instructions`=false, and the world model on it",
+        )  # fmt: skip
+    if config.predicts_success and not config.reads_instructions and count_tasks([chosen]) > 1:
+        logging.warning(
+            "%s: has several tasks, and success is told without the instruction: what one task asks for "
+            "counts in another too. A tokenizer with --model.tokenizer.instructions=true reads it",
+            dataset.root,
+        )
+    longer, longest = table.length[episodes] > config.clip_length, int(table.length[episodes].max())
+    if 2 * longer.sum() > len(episodes) and not config.context_channels:
+        logging.warning(
+            "%s: %d of %d episodes are longer than the clips that are learnt from, clip_length=%d frames "
+            "(%.1f s): success is learnt up to there alone. --model.clip_length=%d holds the longest",
+            dataset.root, longer.sum(), len(episodes), config.clip_length, config.clip_length / dataset.fps,
+            longest,
+        )  # fmt: skip
+    cameras = config.tokenizer.camera_keys
+    depth = cached_depth(dataset, cameras, tokenizer.grid) if config.depth else None
+    if depth is not None and (beyond := float((depth > FAR).mean())) > FAR_SHARE:
+        logging.warning(
+            "%s: %.0f %% of the depth is beyond %.1f m, and is learnt as if it were there",
+            dataset.root, 100 * beyond, FAR,
+        )  # fmt: skip
+    return ClipSampler(
+        table,
+        cached_tokens(dataset, cameras, tokenizer),
+        episodes,
+        config.clip_length,
+        config.from_start,
+        batch_size,
+        seed,
+        config.device,
+        depth=depth,
+        context=cached_context(dataset, cameras, tokenizer) if config.context_channels else None,
+        features=cached_features(dataset, cameras, tokenizer) if config.predicts_success else None,
+    )
+
+
+def make_joint_sampler(
+    model: PreTrainedRewardModel, table: EpisodeTable, data: TrainingData, batch_size: int, seed: int
+) -> ClipSampler | FrameSampler | InTurn:
+    """Make the sampler for the episodes of `data`, which are in `table`, and for its further datasets."""
+    more = data.read_more()
+    with renamed("dataset.root", "dataset.more"):
+        for other in more:
+            check_dataset(model.config, other.dataset.meta)
+            check_instructions(model, other)
+    if isinstance(model.config, ActionWorldModelConfig):
+        note_outcomes(model.config, [(table, data.episodes), *((each, None) for each in more)])
+    first = make_sampler(model, table, data.episodes, batch_size, seed)
+    with renamed("dataset.root", "dataset.more"):
+        samplers = [make_sampler(model, each, None, batch_size, seed) for each in more]
+    return InTurn(first, samplers) if samplers else first
+
+
+def check_instructions(model: Any, table: EpisodeTable) -> None:
+    """Raise FieldError if a text world model cannot read an instruction of a dataset."""
+    if not isinstance(model.config, TextWorldModelConfig):
+        return
+    try:
+        model.text_encoder.check(table.dataset.meta.tasks.index)
+    except ValueError as error:
+        raise FieldError(
+            "dataset.root", table.dataset.root, str(error), "leave it out, or record other instructions"
+        ) from error
+
+
+def note_outcomes(
+    config: ActionWorldModelConfig, sources: Iterable[tuple[EpisodeTable, Sequence[int] | None]]
+) -> None:
+    """Write into a world model's configuration how many successes and failures it learns from.
+
+    A model that is trained further keeps what it has learnt from before, if that was more.
+    """
+    labelled = [(table, chosen) for table, chosen in sources if table.has_labels]
+    learnt = [table.success[table.training(chosen)] for table, chosen in labelled]
+    if not learnt and config.pretrained_path and config.learnt_successes is None:
+        return  # what it has learnt before is not known
+    for table, _ in labelled:
+        if warning := solved_from_the_start(table):
+            logging.warning("%s: %s", table.dataset.root, warning)
+    successes, failures = config.learnt_successes or 0, config.learnt_failures or 0
+    config.learnt_successes = max(successes, sum(int(each.sum()) for each in learnt))
+    config.learnt_failures = max(failures, sum(int((~each).sum()) for each in learnt))
+    if not config.learnt_successes:
+        logging.warning(
+            "no episode is known to succeed: the world model never rewards. RL in it needs labels "
+            "(lerobot-wmrl-label) or a reward of another kind"
+        )
+    elif not config.learnt_failures:
+        logging.warning(
+            "no episode is known to fail: the world model has not seen how one does, and a policy will learn "
+            "what it takes for success. No gate on such episodes can tell; record rollouts with failures"
+        )
