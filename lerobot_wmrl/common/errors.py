@@ -39,7 +39,16 @@ class Stopped(ValueError):
 
 
 class TrainingStopped(Stopped):
-    """Reinforcement learning or distillation cannot go on; the last checkpoint is good."""
+    """Reinforcement learning or distillation cannot go on; the last checkpoint is good.
+
+    Args:
+        message: why, and what to change.
+        before_update: whether the policy is still that of the iteration before, in every process.
+    """
+
+    def __init__(self, message: str, before_update: bool = False) -> None:
+        super().__init__(message)
+        self.before_update = before_update
 
 
 def first_line(error: BaseException) -> str:

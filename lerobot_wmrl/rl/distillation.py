@@ -123,12 +123,14 @@ class Distillation(RLAlgorithm):
             raise TrainingStopped(
                 f"iteration {self.iteration + 1}: the planner has not succeeded in any imagined episode, so "
                 "there is nothing to learn from: raise `algorithm.planner.samples` or "
-                "`algorithm.planner.iterations`, lower `env.done_threshold`, or train the world model longer"
+                "`algorithm.planner.iterations`, lower `env.done_threshold`, or train the world model longer",
+                before_update=True,
             )
         if not min(gather_counts(len(self.labels), env.device)):
             raise TrainingStopped(
                 f"iteration {self.iteration + 1}: in {imagined.count(0)} of {len(imagined)} processes the "
-                "planner has not succeeded in any imagined episode: raise `num_envs`, or use fewer processes"
+                "planner has not succeeded in any imagined episode: raise `num_envs`, or use fewer processes",
+                before_update=True,
             )
         collected = time.perf_counter()
         updates = self.config.last_updates if last else self.config.updates

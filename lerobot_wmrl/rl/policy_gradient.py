@@ -169,10 +169,10 @@ class PolicyGradient(RLAlgorithm):
         """Raise TrainingStopped if the policy is further from the SFT policy than `max_reference_kl`."""
         if kl > self.config.max_reference_kl:
             raise TrainingStopped(
-                f"iteration {self.iteration + 1}: the policy is {kl:.1f} nats a step from the "
+                f"iteration {self.iteration + 1}: the policy is {kl:.3g} nats a step from the "
                 f"SFT policy, above `algorithm.max_reference_kl` ({self.config.max_reference_kl}); raise "
-                "`algorithm.reference_coefficient` or lower `algorithm.policy_lr`"
-            )
+                "`algorithm.reference_coefficient` or lower `algorithm.policy_lr`", before_update=True,
+            )  # fmt: skip
 
     def signal(self, rollout: RolloutBuffer) -> Tensor:
         """Return a number above 0 if there is something to learn from. ()"""
@@ -188,8 +188,8 @@ class PolicyGradient(RLAlgorithm):
                 f"iteration {self.iteration + 1}: {self.without_signal} in {self.unrewarded} iterations, "
                 "so there is nothing to learn from. If imagination sees no success, lower "
                 "`env.done_threshold`, or train the world model longer or on more successes; if the policy "
-                "has none, take one that has, or raise `algorithm.initial_std`"
-            )
+                "has none, take one that has, or raise `algorithm.initial_std`", before_update=True,
+            )  # fmt: skip
 
     def trained_groups(self) -> list[str]:
         """Return the names of the parameter groups that this iteration trains."""

@@ -17,6 +17,7 @@ from lerobot_wmrl.common.checkpoints import (
     should_save_checkpoint,
 )
 from lerobot_wmrl.common.distributed import is_first_process, rank_and_size, wait_for_all
+from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.common.tracking import Tracker
 from lerobot_wmrl.common.training_state import load_training_state, save_checkpoint
@@ -76,7 +77,8 @@ def train(
     """Train until the end of the schedule, from the latest checkpoint in `output_dir` if there is one.
 
     Every iteration starts new episodes, so one that was killed can be repeated. Callbacks that are due run
-    before the first iteration and after each one, always with a checkpoint of that moment.
+    before the first iteration and after each one, always with a checkpoint of that moment. A training that
+    an algorithm stops before it has changed the policy leaves a checkpoint of the iteration before.
 
     Args:
         env: vectorised environment on the device.
@@ -88,6 +90,9 @@ def train(
         save_pretrained: writes a checkpoint's `pretrained_model`.
         callbacks: run between iterations, in this order.
         wandb: LeRobot's WandBLogger.
+
+    Raises:
+        TrainingStopped: the algorithm or a callback ends the training.
     """
     checkpoint, total = resume(algorithm, output_dir), schedule.iterations
     tracker = make_tracker(output_dir, rollout, schedule, algorithm.iteration, wandb)
@@ -100,8 +105,14 @@ def train(
         wait_for_all()  # else a slow process would read records that the first one writes below
         if runner.due(algorithm.iteration):
             runner.run(algorithm.iteration, checkpoint or save(algorithm, output_dir, total, save_pretrained))
+        saved = algorithm.iteration
         while algorithm.iteration < total:
-            metrics = iterate(env, algorithm, pipeline, rollout, schedule)
+            try:
+                metrics = iterate(env, algorithm, pipeline, rollout, schedule)
+            except TrainingStopped as stop:
+                if stop.before_update and algorithm.iteration > saved:
+                    save(algorithm, output_dir, total, save_pretrained)
+                raise TrainingStopped(f"{stop}. {elsewhere(output_dir)}") from stop
             step = algorithm.iteration
             tracker.log_step(step, {**metrics, **runner.real_steps()})
             progress.set_postfix(
@@ -109,9 +120,16 @@ def train(
             )
             progress.update()
             if should_save_checkpoint(step, schedule.save_freq, total) or runner.due(step):
-                checkpoint = save(algorithm, output_dir, total, save_pretrained)
+                checkpoint, saved = save(algorithm, output_dir, total, save_pretrained), step
                 tracker.log_policy(checkpoint)
                 runner.run(step, checkpoint)
+
+
+def elsewhere(output_dir: Path) -> str:
+    """Return how a training that was stopped goes on: with the same settings it would stop again."""
+    begun = newest_checkpoint(output_dir) is not None
+    further = f", and go on from here with `policy.path`={output_dir}" if begun else ""
+    return f"Other settings need another `output_dir`{further}"
 
 
 def iterate(

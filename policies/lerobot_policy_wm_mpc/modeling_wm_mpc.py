@@ -152,7 +152,7 @@ class Proposal:
             steps: T.
         """
         self.policy.reset()
-        instructions, real = list(observed.get("task", [])), [observed]
+        instructions, real = list(observed.get("task", [])), [self.model.shown(observed)]
 
         def act(images: Tensor, state: Tensor) -> Tensor:
             observation = real.pop() if real else self.model.observation(images, state, instructions)

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,6 +15,7 @@ from lerobot_policy_wm_mpc import modeling_wm_mpc
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.images import stretch
 from lerobot_wmrl.common.policies import load_processors, read_policy_config
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
@@ -247,12 +249,15 @@ def test_without_a_search_it_does_what_the_other_policy_does_in_imagination(conf
     torch.testing.assert_close(plan, torch.stack(actions, 1), atol=1e-4, rtol=0)
     assert not torch.allclose(plan[0], plan[1])
 
-    fine = torch.rand(2, 3, 64, 64)  # finer than the tokenizer's frames
-    planning.reset()
-    first = planning.predict_action_chunk({**seen, IMAGE: fine})[:, 0]
-    policy.reset()
-    batch = before({IMAGE: fine, "observation.state": seen["observation.state"], "task": seen["task"]})
-    torch.testing.assert_close(first, after(policy.select_action(batch)).clamp(low, high))
+    fine = torch.rand(2, 3, 64, 64)  # finer than the dataset's frames, of which the policy has seen no others
+    for size in (32, 64):
+        model.config.tokenizer = replace(model.config.tokenizer, frame_sizes=[[size, size]])
+        planning.reset()
+        first = planning.predict_action_chunk({**seen, IMAGE: fine})[:, 0]
+        policy.reset()
+        shown = {**seen, IMAGE: stretch(fine, size, size)}
+        expected = after(policy.select_action(before(shown))).clamp(low, high)
+        torch.testing.assert_close(first, expected)
 
 
 def test_a_policy_that_looks_at_something_else_proposes_nothing(config, tmp_path):

@@ -1,10 +1,13 @@
 """The training loop resumes bit by bit, and trains on seeds that no evaluation uses."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.constants import EVALUATION_SEED
@@ -39,6 +42,14 @@ class FailingEnv(PointEnv):
         if self.left < 0:
             observation["observation.state"] += torch.nan
         return observation, info
+
+
+class Unrewarded(PointEnv):
+    """Pays nothing."""
+
+    def step(self, actions: Tensor) -> Any:
+        observation, reward, *rest = super().step(actions)
+        return observation, 0 * reward, *rest
 
 
 def run(
@@ -98,6 +109,25 @@ def test_not_a_number_stops_training_and_the_last_checkpoint_stays(
     assert last.resolve().name == "000002"
     weights = CnnPolicy.from_pretrained(last / "pretrained_model")
     assert all(value.isfinite().all() for name, value in weights.state_dict().items() if "target" not in name)
+
+
+@pytest.mark.parametrize(("patience", "left"), [(1, None), (3, "000002")])
+def test_a_training_that_is_stopped_leaves_what_it_has_trained(
+    make_policy: MakePolicy, pipeline: Pipeline, tmp_path: Path, patience: int, left: str | None
+) -> None:
+    """Between two checkpoints, too; a policy that has not changed is not saved."""
+    env, policy = Unrewarded(8, 6), make_policy()
+    algorithm = PPO(policy, PPOConfig(patience=patience, value_iterations=0))
+    schedule, buffer = Schedule(10, 10, 0), RolloutBuffer(6, env.num_envs, "cpu")
+    further = f", and go on from here with `policy.path`={tmp_path}" if left else ""
+    message = rf"no episode was rewarded in {patience} .*`output_dir`{re.escape(further)}$"
+    with pytest.raises(TrainingStopped, match=message):
+        train(env, algorithm, pipeline, buffer, schedule, tmp_path, policy.save_pretrained)
+    last = tmp_path / "checkpoints" / "last"
+    assert (last.resolve().name if last.exists() else None) == left
+    if left:
+        saved = CnnPolicy.from_pretrained(last / "pretrained_model").state_dict()
+        assert all(torch.equal(value, saved[name]) for name, value in policy.state_dict().items())
 
 
 def test_training_seeds_are_apart_from_evaluation_seeds() -> None:
