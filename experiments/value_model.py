@@ -23,6 +23,7 @@ from lerobot_wmrl.common.images import random_shift
 from lerobot_wmrl.data.checks import frame_size
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
+from lerobot_wmrl.data.lazy_rows import LazyRows
 
 FOLDS: Final = 3
 WIDTH: Final = 8
@@ -47,13 +48,13 @@ class LabelledFrames:
     """What the value model sees of N frames, and the outcomes of their episodes.
 
     Args:
-        images: (N, C, H, W, 3) uint8 of C cameras, a memory map.
+        images: (N, C, H, W, 3) uint8 of C cameras.
         state: (N, P), normalised.
         instructions: (N,).
         outcome: (N,), 1 where the frame's episode succeeds, else 0.
     """
 
-    images: np.ndarray
+    images: LazyRows
     state: Tensor
     instructions: np.ndarray
     outcome: Tensor

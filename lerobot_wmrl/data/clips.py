@@ -17,6 +17,7 @@ from lerobot_wmrl.common.images import camera_key
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
+from lerobot_wmrl.data.lazy_rows import LazyRows
 
 SUCCESS_SHARE: Final = 0.05
 """Share of what is learnt that shows success, at least: where fewer frames do, they count more."""
@@ -80,7 +81,7 @@ class ClipSampler:
 
     Args:
         table: the episodes.
-        tokens: (rows, S), a memory map.
+        tokens: (rows, S).
         episodes: indices of the episodes to draw from.
         clip_length: T.
         from_start: share of clips that begin with their episode.
@@ -93,16 +94,16 @@ class ClipSampler:
     """
 
     table: EpisodeTable
-    tokens: np.ndarray
+    tokens: LazyRows
     episodes: np.ndarray
     clip_length: int
     from_start: float
     batch_size: int
     seed: int
     device: str
-    depth: np.ndarray | None = None
-    context: np.ndarray | None = None
-    features: np.ndarray | None = None
+    depth: LazyRows | None = None
+    context: LazyRows | None = None
+    features: LazyRows | None = None
 
     def __post_init__(self) -> None:
         """Weigh success by how rare it is."""
@@ -153,7 +154,7 @@ class FrameSampler:
 
     Args:
         table: the episodes.
-        frames: (rows, N, H, W, 3) uint8, a memory map.
+        frames: (rows, N, H, W, 3) uint8.
         episodes: indices of the episodes to draw from.
         cameras: N names.
         batch_size: B.
@@ -162,7 +163,7 @@ class FrameSampler:
     """
 
     table: EpisodeTable
-    frames: np.ndarray
+    frames: LazyRows
     episodes: np.ndarray
     cameras: list[str]
     batch_size: int

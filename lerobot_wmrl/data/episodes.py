@@ -112,6 +112,10 @@ class EpisodeTable:
         """Return where each of the episodes has its frames."""
         return [slice(self.start[each], self.start[each] + self.length[each]) for each in episodes]
 
+    def row_numbers(self, episodes: Iterable[int]) -> np.ndarray:
+        """Return the rows of all these episodes. (K,)"""
+        return np.concatenate([np.arange(rows.start, rows.stop) for rows in self.rows(episodes)])
+
     def subset(self, episodes: np.ndarray) -> "EpisodeTable":
         """Return some of the episodes, a mask (E,) or indices; `validation` means nothing in the result."""
         columns = {name: values[episodes] for name, values in self.columns.items()}

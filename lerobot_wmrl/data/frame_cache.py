@@ -1,9 +1,8 @@
-"""Frames and depth decoded once, tokens encoded once, all in memory-mapped arrays.
+"""Frames and depth decoded once, tokens encoded once, when their episodes are first read.
 
 Reading random windows from video costs milliseconds an item; from these arrays it is a memory copy.
-The caches stand beside the dataset (`<root>.cache/`), never in it, and are rebuilt when absent. What was
-stopped goes on where it was. Depth is brought to the grid of the tokens: metres, 0 where nothing was
-measured, one camera's grid after the other.
+The caches stand beside the dataset (`<root>.cache/`), never in it, and are rebuilt when absent. Depth is
+brought to the grid of the tokens: metres, 0 where nothing was measured, one camera's grid after the other.
 """
 
 import hashlib
@@ -27,9 +26,9 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.hub import cached_repo
 from lerobot_wmrl.common.images import from_bytes, stretch
 from lerobot_wmrl.data.checks import depth_key
-from lerobot_wmrl.data.decoding import decode, decode_depth, row_parts
+from lerobot_wmrl.data.decoding import decode, decode_depth
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
-from lerobot_wmrl.data.resumable_array import WritePlan, batches, memory_map
+from lerobot_wmrl.data.lazy_rows import LazyRows
 
 FAR: Final = 2.5
 """Metres: what is further away counts as that far, as in the recorder's depth maps."""
@@ -73,91 +72,98 @@ def cache_dir(dataset: LeRobotDataset) -> Path:
     return root.with_name(root.name + ".cache")
 
 
-def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str], side: int) -> np.ndarray:
-    """Return all frames as a read-only memory map, uint8 (rows, N, side, side, 3).
-
-    They are decoded on the first call, and stretched where they are of another size.
-    """
+def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str], side: int) -> LazyRows:
+    """Return all frames, uint8 (rows, N, side, side, 3), stretched where they are of another size."""
+    starts = episode_starts(dataset)
     shape = (dataset.num_frames, len(camera_keys), side, side, 3)
     key = digest([dataset.num_episodes, dataset.num_frames, side, *camera_keys, *file_stamps(dataset)])
 
-    def write(target: np.ndarray, episode: int) -> None:
-        for rows in row_parts(dataset, episode):
+    def decoded(rows: np.ndarray) -> np.ndarray:
+        found = np.empty((len(rows), *shape[1:]), np.uint8)
+        for episode, place, part in by_episode(starts, rows):
             for camera, name in enumerate(camera_keys):
-                frames = stretch(decode(dataset, episode, name, rows), side, side)
-                target[rows, camera] = frames.permute(0, 2, 3, 1).numpy()
+                frames = stretch(decode(dataset, episode, name, part), side, side)
+                found[place, camera] = frames.permute(0, 2, 3, 1).numpy()
+        return found
 
-    plan = WritePlan(dataset.num_episodes, write, "Decoding frames")
-    return memory_map(cache_dir(dataset) / f"frames-{key}.npy", shape, np.uint8, plan)
+    path = cache_dir(dataset) / f"frames-{key}.rows"
+    return LazyRows(path, shape, np.uint8, starts, decoded, "Decoding frames")
 
 
-def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder) -> np.ndarray:
-    """Return all frames' tokens as a read-only memory map, int32 (rows, S); encoded on the first call.
+def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder) -> LazyRows:
+    """Return all frames' tokens, int32 (rows, S).
 
     A context-conditioned tokenizer is given the first frame of each row's episode.
     """
-    frames = cached_frames(dataset, camera_keys, tokenizer.image_size)
-    device = tokenizer.device
-    starts = first_rows(dataset)
+    frames, starts = cached_frames(dataset, camera_keys, tokenizer.image_size), episode_starts(dataset)
 
-    def encode(part: slice) -> np.ndarray:
-        first, episode = np.unique(starts[part], return_inverse=True)
-        start, images = (frames_to_tensor(frames[rows]).to(device) for rows in (first, part))
+    def encoded(rows: np.ndarray) -> np.ndarray:
+        first, episode = np.unique(first_rows(starts, rows), return_inverse=True)
+        start, images = (frames_to_tensor(frames[each]).to(tokenizer.device) for each in (first, rows))
         with torch.no_grad():
             context = tokenizer.context(start)[episode]
             return tokenizer.encode(images, context).cpu().numpy()
 
-    shape = (len(frames), tokenizer.tokens_per_frame)
     path = encoded_path("tokens", dataset, camera_keys, tokenizer)
-    return memory_map(path, shape, np.int32, batches(len(frames), encode, "Encoding tokens"))
+    shape = (len(frames), tokenizer.tokens_per_frame)
+    return LazyRows(path, shape, np.int32, starts, encoded, "Encoding tokens")
 
 
-def cached_context(
-    dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder
-) -> np.ndarray:
-    """Return the coarsest features of every episode's context as a read-only memory map.
+def cached_context(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder) -> LazyRows:
+    """Return the coarsest features of every episode's context, float32 (E, N, C, g, g)."""
+    frames, starts = cached_frames(dataset, camera_keys, tokenizer.image_size), episode_starts(dataset)
 
-    float32 (E, N, C, g, g), encoded on the first call.
-    """
-    frames = cached_frames(dataset, camera_keys, tokenizer.image_size)
-    device = tokenizer.device
-    starts = np.asarray(dataset.meta.episodes["dataset_from_index"])
+    @torch.no_grad()
+    def context(images: np.ndarray) -> np.ndarray:
+        return tokenizer.context(frames_to_tensor(images).to(tokenizer.device)).features.cpu().numpy()
 
-    def features(part: slice) -> np.ndarray:
-        with torch.no_grad():
-            context = tokenizer.context(frames_to_tensor(frames[starts[part]]).to(device))
-        return context.features.cpu().numpy()
-
-    shape = (len(starts), *features(slice(0, 1)).shape[1:])
     path = encoded_path("context", dataset, camera_keys, tokenizer)
-    return memory_map(path, shape, np.float32, batches(len(starts), features, "Encoding contexts"))
+    shape = (len(starts), *context(blank(frames)).shape[1:])
+    episodes = np.arange(len(starts))
+    return LazyRows(
+        path, shape, np.float32, episodes, lambda rows: context(frames[starts[rows]]), "Encoding contexts"
+    )
 
 
-def cached_features(
-    dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder
-) -> np.ndarray:
-    """Return the success classifier's features of all frames as a read-only memory map.
+def cached_features(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder) -> LazyRows:
+    """Return the success classifier's features of all frames, float32 (rows, F)."""
+    frames, starts = cached_frames(dataset, camera_keys, tokenizer.image_size), episode_starts(dataset)
 
-    float32 (rows, F), encoded on the first call.
-    """
-    frames = cached_frames(dataset, camera_keys, tokenizer.image_size)
-    device = tokenizer.device
-    starts = first_rows(dataset)
+    @torch.no_grad()
+    def features(*pair: np.ndarray) -> np.ndarray:
+        first, images = (frames_to_tensor(each).to(tokenizer.device) for each in pair)
+        return tokenizer.success_features(first, images).cpu().numpy()
 
-    def features(part: slice) -> np.ndarray:
-        first, images = (frames_to_tensor(frames[rows]).to(device) for rows in (starts[part], part))
-        with torch.no_grad():
-            return tokenizer.success_features(first, images).cpu().numpy()
-
-    shape = (len(frames), *features(slice(0, 1)).shape[1:])
     path = encoded_path("features", dataset, camera_keys, tokenizer)
-    return memory_map(path, shape, np.float32, batches(len(frames), features, "Encoding features"))
+    shape = (len(frames), *features(blank(frames), blank(frames)).shape[1:])
+    return LazyRows(
+        path, shape, np.float32, starts,
+        lambda rows: features(frames[first_rows(starts, rows)], frames[rows]), "Encoding features",
+    )  # fmt: skip
 
 
-def first_rows(dataset: LeRobotDataset) -> np.ndarray:
-    """Return for each row the first row of its episode. (rows,)"""
-    episodes = dataset.meta.episodes
-    return np.repeat(np.asarray(episodes["dataset_from_index"]), np.asarray(episodes["length"]))
+def episode_starts(dataset: LeRobotDataset) -> np.ndarray:
+    """Return each episode's first row. (E,)"""
+    return np.asarray(dataset.meta.episodes["dataset_from_index"])
+
+
+def first_rows(starts: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return for each row the first row of its episode. (K,)"""
+    found: np.ndarray = starts[np.searchsorted(starts, rows, side="right") - 1]
+    return found
+
+
+def by_episode(starts: np.ndarray, rows: np.ndarray) -> Iterator[tuple[int, slice, slice]]:
+    """Divide ascending rows (K,), which follow each other in every episode: yield the episode, where its rows
+    are among them, and these rows."""
+    episodes, places = np.unique(np.searchsorted(starts, rows, side="right") - 1, return_index=True)
+    for episode, begin, end in zip(episodes.tolist(), places, [*places[1:], len(rows)], strict=True):
+        yield episode, slice(begin, end), slice(int(rows[begin]), int(rows[end - 1]) + 1)
+
+
+def blank(frames: LazyRows) -> np.ndarray:
+    """Return one row of black frames, by which the shape of what is made of frames is found."""
+    return np.zeros((1, *frames.shape[1:]), np.uint8)
 
 
 def encoded_path(
@@ -165,7 +171,7 @@ def encoded_path(
 ) -> Path:
     """Return the path of the cache `name`, which is valid for these weights, cameras and files alone."""
     key = digest([weights_digest(tokenizer.state_dict()), *camera_keys, *file_stamps(dataset)])
-    return cache_dir(dataset) / f"{name}-{key}.npy"
+    return cache_dir(dataset) / f"{name}-{key}.rows"
 
 
 def frames_to_tensor(frames: np.ndarray) -> Tensor:
@@ -215,20 +221,22 @@ def token_depth(metres: Tensor, grid: int) -> Tensor:
     return torch.where(share > 0, mean / share, 0.0).flatten(1)
 
 
-def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int) -> np.ndarray:
-    """Return all frames' depth as a read-only memory map, float32 (rows, S) metres; decoded once."""
+def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int) -> LazyRows:
+    """Return all frames' depth, float32 (rows, S) metres."""
     keys = [depth_key(camera) for camera in camera_keys]
     encodings = [dataset.features[name].get("info") for name in keys]
     key = digest([dataset.num_episodes, dataset.num_frames, grid, *keys, *encodings, *file_stamps(dataset)])
 
-    def write(target: np.ndarray, episode: int) -> None:
-        for rows in row_parts(dataset, episode):
-            cameras = [token_depth(decode_depth(dataset, episode, name, rows), grid) for name in keys]
-            target[rows] = torch.cat(cameras, 1).numpy()
+    def decoded(rows: np.ndarray) -> np.ndarray:
+        found = []
+        for episode, _, part in by_episode(starts, rows):
+            cameras = [token_depth(decode_depth(dataset, episode, name, part), grid) for name in keys]
+            found.append(torch.cat(cameras, 1).numpy())
+        return np.concatenate(found)
 
-    shape = (dataset.num_frames, len(keys) * grid**2)
-    episodes = WritePlan(dataset.num_episodes, write, "Decoding depth")
-    return memory_map(cache_dir(dataset) / f"depth-{key}.npy", shape, np.float32, episodes)
+    starts, shape = episode_starts(dataset), (dataset.num_frames, len(keys) * grid**2)
+    path = cache_dir(dataset) / f"depth-{key}.rows"
+    return LazyRows(path, shape, np.float32, starts, decoded, "Decoding depth")
 
 
 def unmeasured_depth(features: Mapping[str, Any], camera_keys: Sequence[str]) -> list[float]:

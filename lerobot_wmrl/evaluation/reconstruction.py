@@ -15,6 +15,7 @@ from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.episodes import EpisodeTable, choose_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
+from lerobot_wmrl.data.lazy_rows import LazyRows
 from lerobot_wmrl.evaluation.image_metrics import motion_mask, psnr_from_mse
 from lerobot_wmrl.world_models.codebook import CodeBook, make_codebook, perplexity
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import FrameTokenizerRewardModel
@@ -46,7 +47,7 @@ class Reconstruction:
 
 
 def reconstruction_metrics(
-    model: TokenizingModel, table: EpisodeTable, frames: np.ndarray, episodes: np.ndarray
+    model: TokenizingModel, table: EpisodeTable, frames: LazyRows, episodes: np.ndarray
 ) -> dict[str, Any]:
     """Measure PSNR (dB) per camera, of whole frames and of the pixels that moved, and the use of the codes.
 
@@ -80,7 +81,7 @@ def reconstruction_metrics(
 
 @torch.no_grad()
 def reconstruct(
-    model: TokenizingModel, frames: np.ndarray, rows: np.ndarray, starts: np.ndarray
+    model: TokenizingModel, frames: LazyRows, rows: np.ndarray, starts: np.ndarray
 ) -> Reconstruction:
     """Encode and decode the frames `rows` (R,) of episodes that began at the rows `starts` (R,)."""
     device, parts = model.tokenizer.device, []
@@ -137,7 +138,7 @@ def _rows(table: EpisodeTable, episodes: np.ndarray) -> tuple[np.ndarray, np.nda
     """Return the rows of the episodes, evenly thinned, and for each the row where its episode begins."""
     lengths = table.length[episodes]
     starts = np.repeat(table.start[episodes], lengths)
-    rows = np.concatenate([np.arange(rows.start, rows.stop) for rows in table.rows(episodes)])
+    rows = table.row_numbers(episodes)
     kept = evenly_spaced(len(rows), MAX_FRAMES)
     return rows[kept], starts[kept]
 

@@ -12,6 +12,7 @@ from tqdm import tqdm
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.data.frames import Context, Frames
+from lerobot_wmrl.data.lazy_rows import LazyRows
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
@@ -32,7 +33,7 @@ class Recording:
     """Recorded episodes: their table, and all their frames, uint8 (rows, N, H, W, 3)."""
 
     table: EpisodeTable
-    frames: np.ndarray
+    frames: LazyRows
 
     @classmethod
     def read(cls, table: EpisodeTable, model: Any) -> "Recording":

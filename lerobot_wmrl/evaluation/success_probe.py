@@ -16,6 +16,7 @@ from tqdm import trange
 
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
+from lerobot_wmrl.data.lazy_rows import LazyRows
 from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 
@@ -144,7 +145,7 @@ def labelled_frames(
 
 @torch.no_grad()
 def shrunk_reconstructions(
-    tokenizer: FrameTokenizer, frames: np.ndarray, rows: np.ndarray, starts: np.ndarray
+    tokenizer: FrameTokenizer, frames: LazyRows, rows: np.ndarray, starts: np.ndarray
 ) -> Tensor:
     """Encode and decode recorded frames, at the probe's size: rows (R,) → (R, N, 3, h, w).
 

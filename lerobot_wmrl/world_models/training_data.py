@@ -111,12 +111,11 @@ def make_sampler(
             )  # fmt: skip
         if config.tokenizer.success and table.success[episodes].any():
             require_shown(table, episodes.nonzero()[0])
-        tokenizer_config = config.tokenizer
-        frames, cameras = (
-            cached_frames(table.dataset, tokenizer_config.camera_keys, tokenizer_config.image_size),
-            tokenizer_config.cameras,
+        frames = cached_frames(table.dataset, config.tokenizer.camera_keys, config.tokenizer.image_size)
+        frames.fill(table.row_numbers(episodes.nonzero()[0]))
+        return FrameSampler(
+            table, frames, episodes.nonzero()[0], config.tokenizer.cameras, batch_size, seed, config.device
         )
-        return FrameSampler(table, frames, episodes.nonzero()[0], cameras, batch_size, seed, config.device)
     if isinstance(config, TextWorldModelConfig):
         episodes = require_golden(table, episodes & golden_episodes(table))
     elif not table.has_labels:
@@ -153,26 +152,25 @@ def make_clip_sampler(
             dataset.root, longer.sum(), len(episodes), config.clip_length, config.clip_length / dataset.fps,
             longest,
         )  # fmt: skip
-    cameras = config.tokenizer.camera_keys
+    cameras, rows = config.tokenizer.camera_keys, table.row_numbers(episodes)
     depth = cached_depth(dataset, cameras, tokenizer.grid) if config.depth else None
-    if depth is not None and (beyond := float((depth > FAR).mean())) > FAR_SHARE:
+    if depth is not None and (beyond := float((depth[rows] > FAR).mean())) > FAR_SHARE:
         logging.warning(
             "%s: %.0f %% of the depth is beyond %.1f m, and is learnt as if it were there",
             dataset.root, 100 * beyond, FAR,
         )  # fmt: skip
+    tokens = cached_tokens(dataset, cameras, tokenizer)
+    tokens.fill(rows)
+    context = cached_context(dataset, cameras, tokenizer) if config.context_channels else None
+    if context is not None:
+        context.fill(episodes)
+    features = cached_features(dataset, cameras, tokenizer) if config.predicts_success else None
+    if features is not None:
+        features.fill(rows)
     return ClipSampler(
-        table,
-        cached_tokens(dataset, cameras, tokenizer),
-        episodes,
-        config.clip_length,
-        config.from_start,
-        batch_size,
-        seed,
-        config.device,
-        depth=depth,
-        context=cached_context(dataset, cameras, tokenizer) if config.context_channels else None,
-        features=cached_features(dataset, cameras, tokenizer) if config.predicts_success else None,
-    )
+        table, tokens, episodes, config.clip_length, config.from_start, batch_size, seed, config.device,
+        depth=depth, context=context, features=features,
+    )  # fmt: skip
 
 
 def make_joint_sampler(

@@ -15,7 +15,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.data import decoding, frame_cache
+from lerobot_wmrl.data import frame_cache, lazy_rows
 from lerobot_wmrl.data.checks import check_cameras
 from lerobot_wmrl.data.dataset import ChosenEpisodes, TrainingData, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
@@ -76,7 +76,7 @@ def test_what_was_not_measured_does_not_count():
 @pytest.mark.parametrize(("dtype", "unit"), [(np.uint16, 1000), (np.float32, 1)])
 def test_depth_stored_as_images_is_read_in_its_unit(dtype, unit, tmp_path, monkeypatch):
     """A long episode in parts."""
-    monkeypatch.setattr(decoding, "DECODED", 2)
+    monkeypatch.setattr(lazy_rows, "BATCH", 2)
     depth_map = {
         "dtype": "image", "shape": (SIZE, SIZE, 1), "names": ["height", "width", "channels"],
         "info": {"is_depth_map": True},

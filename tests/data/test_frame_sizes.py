@@ -1,20 +1,23 @@
 """Frames of other sizes than the world model's."""
 
-import errno
-import os
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from torch import Tensor
 
-from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import stretch
-from lerobot_wmrl.data import decoding, frame_cache
+from lerobot_wmrl.data import frame_cache, lazy_rows
 from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.decoding import decode
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
+from lerobot_wmrl.world_models.training_data import make_sampler
 
 
 def test_long_episodes_are_decoded_in_parts_to_the_same_frames(
@@ -22,24 +25,36 @@ def test_long_episodes_are_decoded_in_parts_to_the_same_frames(
 ) -> None:
     cameras = ["observation.images.third_view"]
     caches = []
-    for part in (decoding.DECODED, 7):
-        monkeypatch.setattr(decoding, "DECODED", part)
+    for part in (lazy_rows.BATCH, 7):
+        monkeypatch.setattr(lazy_rows, "BATCH", part)
         monkeypatch.setattr(frame_cache, "cache_dir", lambda _, part=part: tmp_path / str(part))
-        caches.append(cached_frames(small_dataset, cameras, 32))
+        caches.append(np.array(cached_frames(small_dataset, cameras, 32)))
     np.testing.assert_array_equal(*caches)
 
 
-def test_a_disk_that_is_full_says_so_and_leaves_nothing(
+def test_episodes_that_nobody_reads_are_not_decoded(
     small_dataset: LeRobotDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
+    """A tokenizer learns from two chosen episodes; the video of another one may be broken."""
 
-    monkeypatch.setattr(os, "posix_fallocate", full)
-    monkeypatch.setattr(frame_cache, "cache_dir", lambda _: tmp_path / "cache")
-    with pytest.raises(FieldError, match=r"which cannot be written .*No space left"):
-        cached_frames(small_dataset, ["observation.images.third_view"], 32)
-    assert not list((tmp_path / "cache").iterdir())
+    def decoded(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -> Tensor:
+        if episode == 2:
+            raise ValueError("cannot be decoded")
+        seen.add(episode)
+        return decode(dataset, episode, key, rows)
+
+    seen: set[int] = set()
+    monkeypatch.setattr(frame_cache, "decode", decoded)
+    monkeypatch.setattr(frame_cache, "cache_dir", lambda _: tmp_path)
+    model = SimpleNamespace(name="frame_tokenizer", config=SimpleNamespace(
+        tokenizer=TokenizerConfig(cameras=["third_view"], image_size=32), device="cpu",
+    ))  # fmt: skip
+    sampler: Any = make_sampler(model, read_episodes(small_dataset), [1, 4], batch_size=64, seed=0)
+    assert seen == {1, 4}
+    sampler(0)
+    assert seen == {1, 4}
+    with pytest.raises(ValueError, match="cannot be decoded"):
+        make_sampler(model, read_episodes(small_dataset), [2], batch_size=2, seed=0)
 
 
 def test_caches_lie_beside_the_dataset_wherever_a_command_is_called(

@@ -193,7 +193,7 @@ def test_stored_images_are_what_the_camera_saw_and_read_like_videos(tmp_path: Pa
         root = tmp_path / str(video) / "dataset"
         assert (root / "README.md").is_file()
         dataset = open_dataset(root)
-        shown[video] = cached_frames(dataset, dataset.meta.camera_keys, 32).astype(int)
+        shown[video] = cached_frames(dataset, dataset.meta.camera_keys, 32)[:].astype(int)
         assert bool(list(root.rglob("*.mp4"))) is video
     assert shown[True].shape == shown[False].shape
     difference = np.abs(shown[True] - shown[False])

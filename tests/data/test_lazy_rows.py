@@ -1,0 +1,117 @@
+"""Rows on disk are computed when they are read, once, and go on where that was stopped."""
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_wmrl.data import lazy_rows
+from lerobot_wmrl.data.lazy_rows import LazyRows
+
+FIRST = np.array([0, 2, 3, 6])
+"""Of units of two, one, three and four rows."""
+
+Compute = Callable[[np.ndarray], np.ndarray]
+
+
+def rows_at(path: Path, computed: list[int], stop_at: int = -1, by: type = KeyboardInterrupt) -> LazyRows:
+    """Return ten rows, each its number twice, that note which of them were computed."""
+
+    def numbers(rows: np.ndarray) -> np.ndarray:
+        if stop_at in rows:
+            raise by
+        computed.extend(rows.tolist())
+        return np.stack([rows, rows], 1)
+
+    return LazyRows(path, (10, 2), np.int32, FIRST, numbers, "Counting")
+
+
+class Killed(BaseException):
+    """Ends the process as a kill does: nothing is tidied up."""
+
+    def __init__(self) -> None:
+        os._exit(9)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "data.cache" / "numbers-1.rows"
+
+
+@pytest.mark.parametrize(("index", "units"), [
+    (4, [3, 4, 5]), (slice(1, 3), [0, 1, 2]), (np.array([[0, 9], [9, 1]]), [0, 1, 6, 7, 8, 9]),
+    ((2, 1), [2]), (np.arange(10) == 2, [2]), (slice(0, 0), []),
+])  # fmt: skip
+def test_what_is_read_is_computed_with_its_unit_and_once(path: Path, index: object, units: list[int]) -> None:
+    computed: list[int] = []
+    rows, every = rows_at(path, computed), np.repeat(np.arange(10)[:, None], 2, 1)
+    np.testing.assert_array_equal(rows[index], every[index])
+    assert computed == units
+    rows[index]
+    rows_at(path, computed)[index]
+    assert computed == units, "also by another process, later"
+    np.testing.assert_array_equal(rows, every)
+    assert sorted(computed) == list(range(10))
+
+
+@pytest.mark.parametrize("by", [KeyboardInterrupt, ValueError])
+def test_what_was_stopped_goes_on(path: Path, monkeypatch: pytest.MonkeyPatch, by: type) -> None:
+    """Whole units stay, a row of the next one does not count."""
+    monkeypatch.setattr(lazy_rows, "BATCH", 2)
+    computed: list[int] = []
+    with pytest.raises(by):
+        rows_at(path, computed, stop_at=5, by=by)[:]
+    assert computed == [0, 1, 2, 3]
+    again: list[int] = []
+    assert rows_at(path, again)[:, 0].tolist() == list(range(10))
+    assert again == [3, 4, 5, 6, 7, 8, 9]
+
+
+def test_a_killed_process_loses_seconds(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it has computed is on disk, and noted there."""
+    monkeypatch.setattr(lazy_rows, "BATCH", 3)
+    monkeypatch.setattr(lazy_rows, "PROGRESS_SECONDS", 0)
+    if not (child := os.fork()):
+        rows_at(path, [], stop_at=6, by=Killed)[:]
+        sys.exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+    again: list[int] = []
+    rows_at(path, again)[:]
+    assert again == [6, 7, 8, 9]
+
+
+def test_processes_fill_one_file_at_once(path: Path) -> None:
+    """Each sees at once what the other has computed."""
+    ours: list[int] = []
+    theirs: list[int] = []
+    first, second = rows_at(path, ours), rows_at(path, theirs)
+    first[0], second[3], first[4], second[1]
+    assert (ours, theirs) == ([0, 1], [3, 4, 5])
+
+
+def test_nobody_writes_into_what_is_read(path: Path) -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        rows_at(path, [])[0:2][0] = 7
+
+
+def test_a_full_disk_is_said_before_anything_is_computed(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(descriptor: int, offset: int, size: int) -> None:
+        assert (offset, size) == (3 * 8, 3 * 8), "room for the rows of the unit"
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    computed: list[int] = []
+    with pytest.raises(ValueError, match=r"^dataset\.root=.*data: .* cannot be written .*No space.*; make"):
+        rows_at(path, computed)[4]
+    assert computed == []
+    assert path.stat().st_blocks * 512 <= 8192, "rows that nobody has read take no room"
+
+
+def test_a_cache_that_must_not_be_written_is_read(path: Path) -> None:
+    rows_at(path, [])[:]
+    path.chmod(0o400)
+    assert rows_at(path, computed := [])[9, 0] == 9
+    assert computed == []
