@@ -1,7 +1,9 @@
 """The training loop: collect, update, log, save, and run callbacks. It resumes bit for bit on a CPU."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from lerobot.utils.logging_utils import MetricsTracker
 from tqdm import tqdm
 
 from lerobot_wmrl.common.checkpoints import (
+    checkpoint_dir,
     newest_checkpoint,
     read_weights,
     should_save_checkpoint,
@@ -95,6 +98,7 @@ def train(
         TrainingStopped: the algorithm or a callback ends the training.
     """
     checkpoint, total = resume(algorithm, output_dir), schedule.iterations
+    write = partial(save, algorithm, output_dir, total, save_pretrained)
     tracker = make_tracker(output_dir, rollout, schedule, algorithm.iteration, wandb)
     runner = Callbacks(callbacks, output_dir, total, tracker)
     with tqdm(
@@ -104,15 +108,10 @@ def train(
         runner.resume(algorithm.iteration)
         wait_for_all()  # else a slow process would read records that the first one writes below
         if runner.due(algorithm.iteration):
-            runner.run(algorithm.iteration, checkpoint or save(algorithm, output_dir, total, save_pretrained))
-        saved = algorithm.iteration
+            runner.run(algorithm.iteration, checkpoint or write())
         while algorithm.iteration < total:
-            try:
+            with saving_at_a_stop(output_dir, total, algorithm.iteration, write):
                 metrics = iterate(env, algorithm, pipeline, rollout, schedule)
-            except TrainingStopped as stop:
-                if stop.before_update and algorithm.iteration > saved:
-                    save(algorithm, output_dir, total, save_pretrained)
-                raise TrainingStopped(f"{stop}. {elsewhere(output_dir)}") from stop
             step = algorithm.iteration
             tracker.log_step(step, {**metrics, **runner.real_steps()})
             progress.set_postfix(
@@ -120,16 +119,27 @@ def train(
             )
             progress.update()
             if should_save_checkpoint(step, schedule.save_freq, total) or runner.due(step):
-                checkpoint, saved = save(algorithm, output_dir, total, save_pretrained), step
+                checkpoint = write()
                 tracker.log_policy(checkpoint)
                 runner.run(step, checkpoint)
 
 
-def elsewhere(output_dir: Path) -> str:
-    """Return how a training that was stopped goes on: with the same settings it would stop again."""
-    begun = newest_checkpoint(output_dir) is not None
-    further = f", and go on from here with `policy.path`={output_dir}" if begun else ""
-    return f"Other settings need another `output_dir`{further}"
+@contextmanager
+def saving_at_a_stop(
+    output_dir: Path, total: int, iteration: int, write: Callable[[], Path]
+) -> Iterator[None]:
+    """Let the algorithm's TrainingStopped say how to go on, since the same settings would stop again.
+
+    A policy that is still that of `iteration`, the last finished one, is written unless it is there.
+    """
+    try:
+        yield
+    except TrainingStopped as stop:
+        if stop.before_update and iteration and not checkpoint_dir(output_dir, total, iteration).is_dir():
+            write()
+        begun = newest_checkpoint(output_dir) is not None
+        further = f", and go on from here with `policy.path`={output_dir}" if begun else ""
+        raise TrainingStopped(f"{stop}. Other settings need another `output_dir`{further}") from stop
 
 
 def iterate(
