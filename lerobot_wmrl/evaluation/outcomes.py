@@ -200,6 +200,7 @@ def predict_outcomes(model: ActionWorldModelRewardModel, recording: Recording) -
 def predict_done(model: ActionWorldModelRewardModel, recording: Recording) -> Iterator[PredictedDone]:
     """Predict done for all episodes open loop, short ones first, without drawing frames."""
     device, length = model.device, recording.table.length
+    recording.frames.fill(recording.table.start)
     for batch in in_batches(np.argsort(length, kind="stable")):
         actions = recording.actions(batch, int(length[batch].max()), device)
         ahead = model.open_loop(recording.starts(model, batch), actions, with_tokens=False)

@@ -1,7 +1,7 @@
 """Reconstruction by a tokenizer: PSNR of recorded frames, camera by camera, and its use of the codes."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.data.lazy_rows import LazyRows
 from lerobot_wmrl.evaluation.image_metrics import motion_mask, psnr_from_mse
 from lerobot_wmrl.world_models.codebook import CodeBook, make_codebook, perplexity
+from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import FrameTokenizerRewardModel
 from lerobot_wmrl.world_models.modeling_world_model import WorldModelRewardModel
 
@@ -79,22 +80,36 @@ def reconstruction_metrics(
     }
 
 
-@torch.no_grad()
 def reconstruct(
     model: TokenizingModel, frames: LazyRows, rows: np.ndarray, starts: np.ndarray
 ) -> Reconstruction:
     """Encode and decode the frames `rows` (R,) of episodes that began at the rows `starts` (R,)."""
-    device, parts = model.tokenizer.device, []
-    for begin in trange(0, len(rows), BATCH, desc="Reconstructing frames", unit="batch"):
-        part = slice(begin, begin + BATCH)
-        recorded, start = (frames_to_tensor(frames[index[part]]).to(device) for index in (rows, starts))
-        context = model.tokenizer.context(start)
-        tokens = model.tokenizer.encode(recorded, context)
-        error = (model.tokenizer.decode(tokens, context) - recorded).square()
+    parts = []
+    for start, recorded, tokens, decoded in reconstructions(model.tokenizer, frames, rows, starts):
+        error = (decoded - recorded).square()
         moved = motion_mask(recorded, start)[:, :, None].expand_as(error)
         sums = (error * moved).sum((2, 3, 4)), moved.sum((2, 3, 4))
         parts.append((tokens, error.mean((2, 3, 4)), *sums))
     return Reconstruction(*(torch.cat(column).cpu() for column in zip(*parts, strict=True)))
+
+
+@torch.no_grad()
+def reconstructions(
+    tokenizer: FrameTokenizer, frames: LazyRows, rows: np.ndarray, starts: np.ndarray
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """Yield, in batches, the first frames of these rows' episodes, the recorded frames, their tokens and what
+    is decoded from them; frames are (B, N, 3, H, W) in [0, 1].
+
+    rows (R,); starts (R,): the first rows of their episodes.
+    """
+    frames.fill(rows)
+    for begin in trange(0, len(rows), BATCH, desc="Reconstructing frames", unit="batch"):
+        part = slice(begin, begin + BATCH)
+        pair = starts[part], rows[part]
+        start, recorded = (frames_to_tensor(frames[each]).to(tokenizer.device) for each in pair)
+        context = tokenizer.context(start)
+        tokens = tokenizer.encode(recorded, context)
+        yield start, recorded, tokens, tokenizer.decode(tokens, context)
 
 
 def code_use(codebook: CodeBook, tokens: Tensor) -> dict[str, Any]:

@@ -15,8 +15,7 @@ from torch.nn import functional as F
 from tqdm import trange
 
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.data.frame_cache import frames_to_tensor
-from lerobot_wmrl.data.lazy_rows import LazyRows
+from lerobot_wmrl.evaluation.reconstruction import reconstructions
 from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 
@@ -30,7 +29,6 @@ PROBE_SIZE = 64
 PROBE_EPOCHS = 10
 PROBE_BATCH = 64
 PROBE_LEARNING_RATE = 1e-3
-ENCODE_BATCH = 128
 
 
 class SuccessProbe(nn.Module):
@@ -138,26 +136,11 @@ def labelled_frames(
     index = np.concatenate([rng.choice(of_class, count, replace=False) for of_class in classes])
     starts = table.start[episodes[index]]
     first, images = (
-        shrunk_reconstructions(tokenizer, recording.frames, which, starts) for which in (starts, rows[index])
+        torch.cat([_small(shown) for *_, shown in reconstructions(tokenizer, recording.frames, each, starts)])
+        for each in (starts, rows[index])
     )
+    first, images = (each.unflatten(1, (-1, 3)) for each in (first, images))
     return LabelledFrames(first, images, torch.from_numpy(success[index]).to(images.device))
-
-
-@torch.no_grad()
-def shrunk_reconstructions(
-    tokenizer: FrameTokenizer, frames: LazyRows, rows: np.ndarray, starts: np.ndarray
-) -> Tensor:
-    """Encode and decode recorded frames, at the probe's size: rows (R,) → (R, N, 3, h, w).
-
-    starts (R,): the first rows of their episodes.
-    """
-    device, parts = tokenizer.device, []
-    for begin in range(0, len(rows), ENCODE_BATCH):
-        part = slice(begin, begin + ENCODE_BATCH)
-        images, first = (frames_to_tensor(frames[which[part]]).to(device) for which in (rows, starts))
-        context = tokenizer.context(first)
-        parts.append(_small(tokenizer.decode(tokenizer.encode(images, context), context)))
-    return torch.cat(parts).unflatten(1, (-1, 3))
 
 
 def _small(images: Tensor) -> Tensor:
