@@ -33,6 +33,9 @@ from lerobot_wmrl.data.lazy_rows import LazyRows
 FAR: Final = 2.5
 """Metres: what is further away counts as that far, as in the recorder's depth maps."""
 
+NEAREST: Final = 0.05
+"""Metres within which the depth of a whole batch is not, unless it is in another unit."""
+
 ROUNDING_METRES: Final = 1e-4
 """Metres by which a depth may differ from the one that stands for no measurement."""
 
@@ -258,12 +261,19 @@ def depth_of_windows(
     (B, T, 1, H, W) of each camera → (B, T, S). `unmeasured`: what stands for no measurement, in metres.
 
     Raises:
-        FieldError: the depth of a camera is missing.
+        FieldError: the depth of a camera is missing, or is in metres.
     """
     missing = [name for name in map(depth_key, camera_keys) if name not in batch]
     if missing:
         raise FieldError("depth", True, f"the batch lacks {missing}", "use a dataset recorded with depth")
     given = [batch[depth_key(camera)].float() / MM_PER_METRE for camera in camera_keys]
+    farthest = max(each.max().item() for each in given)
+    if 0 < farthest < NEAREST:
+        raise FieldError(
+            "dataset.depth_output_unit", "m",
+            f"no depth of this batch is above {MM_PER_METRE * farthest:.3g} mm, so it is in metres",
+            "leave it out: world models read millimetres",
+        )  # fmt: skip
     least = [none + ROUNDING_METRES for none in unmeasured]
     maps = [torch.where(each > at, each, 0.0) for each, at in zip(given, least, strict=True)]
     cameras = [token_depth(each.flatten(0, 1), grid).unflatten(0, each.shape[:2]) for each in maps]

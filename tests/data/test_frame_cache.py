@@ -132,6 +132,13 @@ def test_cameras_may_have_depth_of_different_sizes():
     assert torch.equal(depth, torch.tensor([1.0, 2.0]).repeat_interleave(GRID**2).expand(2, 3, -1))
 
 
+def test_depth_in_metres_is_refused():
+    """lerobot-train gives it so with --dataset.depth_output_unit=m."""
+    batch = {"top_depth": torch.full((2, 3, 1, 16, 16), 1.2)}
+    with pytest.raises(ValueError, match=r"depth_output_unit=m: no depth of this batch is above 1\.2 mm"):
+        depth_of_windows(batch, ["top"], GRID, [0.0])
+
+
 @pytest.mark.parametrize("name", ["third_view_depth", "../state"])
 def test_only_a_camera_of_colours_is_looked_at(name, deep_dataset):
     features = {**deep_dataset.features, "observation.images.../state": deep_dataset.features["action"]}
