@@ -32,6 +32,7 @@ def outcomes_with(model: Any, table: EpisodeTable, instructions: Sequence[str]) 
     tokenizer = model.tokenizer
     features = cached_features(table.dataset, model.config.tokenizer.camera_keys, tokenizer)
     reader = tokenizer.success.instructions
+    features.fill(slice(None))
     judged = []
     for episode, rows in enumerate(table.rows(range(len(table.start)))):
         seen = torch.from_numpy(np.array(features[rows]))

@@ -97,7 +97,7 @@ def row_in(features: Mapping[str, Any], row: Mapping[str, Any]) -> dict[str, Any
 
 
 def _is_number(feature: Mapping[str, Any]) -> bool:
-    return feature["dtype"] not in ("image", "video", "string")
+    return str(feature["dtype"]).startswith(("bool", "int", "uint", "float"))
 
 
 def _holds(feature: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
@@ -105,7 +105,10 @@ def _holds(feature: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     return (
         _is_number(feature) and _is_number(other)
         and tuple(feature["shape"]) == tuple(other["shape"])
-        and np.can_cast(other["dtype"], feature["dtype"], "same_kind")
+        and np.can_cast(
+            other["dtype"], feature["dtype"],
+            "same_kind" if str(other["dtype"]).startswith("float") else "safe",
+        )
     )  # fmt: skip
 
 

@@ -30,6 +30,12 @@ from lerobot_wmrl.data.decoding import decode, decode_depth
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.data.lazy_rows import LazyRows
 
+DECODED: Final = 256
+"""Frames that are decoded at once: those of a long episode would not fit into the memory."""
+
+ENCODED: Final = 128
+"""Frames that are encoded at once."""
+
 FAR: Final = 2.5
 """Metres: what is further away counts as that far, as in the recorder's depth maps."""
 
@@ -90,7 +96,7 @@ def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str], side: int
         return found
 
     path = cache_dir(dataset) / f"frames-{key}.rows"
-    return LazyRows(path, shape, np.uint8, starts, decoded, "Decoding frames")
+    return LazyRows(path, shape, np.uint8, starts, decoded, DECODED, "Decoding frames")
 
 
 def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder) -> LazyRows:
@@ -109,7 +115,7 @@ def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer
 
     path = encoded_path("tokens", dataset, camera_keys, tokenizer)
     shape = (len(frames), tokenizer.tokens_per_frame)
-    return LazyRows(path, shape, np.int32, starts, encoded, "Encoding tokens")
+    return LazyRows(path, shape, np.int32, starts, encoded, ENCODED, "Encoding tokens")
 
 
 def cached_context(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder) -> LazyRows:
@@ -122,10 +128,10 @@ def cached_context(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenize
 
     path = encoded_path("context", dataset, camera_keys, tokenizer)
     shape = (len(starts), *context(blank(frames)).shape[1:])
-    episodes = np.arange(len(starts))
     return LazyRows(
-        path, shape, np.float32, episodes, lambda rows: context(frames[starts[rows]]), "Encoding contexts"
-    )
+        path, shape, np.float32, np.arange(len(starts)), lambda rows: context(frames[starts[rows]]), ENCODED,
+        "Encoding contexts",
+    )  # fmt: skip
 
 
 def cached_features(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder) -> LazyRows:
@@ -141,13 +147,19 @@ def cached_features(dataset: LeRobotDataset, camera_keys: Sequence[str], tokeniz
     shape = (len(frames), *features(blank(frames), blank(frames)).shape[1:])
     return LazyRows(
         path, shape, np.float32, starts,
-        lambda rows: features(frames[first_rows(starts, rows)], frames[rows]), "Encoding features",
+        lambda rows: features(frames[first_rows(starts, rows)], frames[rows]), ENCODED, "Encoding features",
     )  # fmt: skip
 
 
 def episode_starts(dataset: LeRobotDataset) -> np.ndarray:
-    """Return each episode's first row. (E,)"""
-    return np.asarray(dataset.meta.episodes["dataset_from_index"])
+    """Return each episode's first row. (E,) FieldError unless they follow each other."""
+    starts = np.asarray(dataset.meta.episodes["dataset_from_index"][:])  # slow row by row
+    if (np.diff(starts) <= 0).any():
+        raise FieldError(
+            "dataset.root", dataset.root, "its episodes' rows do not follow each other",
+            "write it anew with lerobot-edit-dataset",
+        )  # fmt: skip
+    return starts
 
 
 def first_rows(starts: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -239,7 +251,15 @@ def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int)
 
     starts, shape = episode_starts(dataset), (dataset.num_frames, len(keys) * grid**2)
     path = cache_dir(dataset) / f"depth-{key}.rows"
-    return LazyRows(path, shape, np.float32, starts, decoded, "Decoding depth")
+    return LazyRows(
+        path,
+        shape,
+        np.float32,
+        starts,
+        decoded,
+        DECODED,
+        "Decoding depth",
+    )
 
 
 def unmeasured_depth(features: Mapping[str, Any], camera_keys: Sequence[str]) -> list[float]:

@@ -1,6 +1,6 @@
 """Predicted and recorded success of episodes, frame by frame: what the gate and the judge count."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
@@ -212,7 +212,7 @@ def predict_done(model: ActionWorldModelRewardModel, recording: Recording) -> It
 
 @torch.no_grad()
 def seen_outcomes(
-    model: ActionWorldModelRewardModel, recording: Recording, episodes: Iterable[int]
+    model: ActionWorldModelRewardModel, recording: Recording, episodes: Sequence[int] | np.ndarray
 ) -> Outcomes | None:
     """Judge recorded frames, not imagined ones, by the success classifier that the model has success from.
 
@@ -226,6 +226,8 @@ def seen_outcomes(
     if not isinstance(done, PredictedSuccess) or not table.has_labels:
         return None
     features = cached_features(table.dataset, model.config.tokenizer.camera_keys, model.tokenizer)
+
+    features.fill(table.row_numbers(episodes))
 
     def judged(episode: int) -> PredictedDone:
         rows = recording.rows(episode)

@@ -23,6 +23,7 @@ from lerobot_wmrl.data.frame_cache import (
     cached_frames,
     cached_tokens,
 )
+from lerobot_wmrl.data.lazy_rows import LazyRows
 from lerobot_wmrl.world_models.checkpoint import check_dataset
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
@@ -102,6 +103,9 @@ def make_sampler(
             "record some first, or choose others with `dataset.episodes`: every twentieth is held out",
         )  # fmt: skip
     config: Any = model.config
+    frames = cached_frames(table.dataset, config.tokenizer.camera_keys, config.tokenizer.image_size)
+    # held-out episodes are measured after hours of training: what cannot be decoded says so now
+    frames.fill(table.row_numbers(table.among(chosen).nonzero()[0]))
     if model.name == "frame_tokenizer":
         if config.tokenizer.success and not table.has_labels:
             raise FieldError(
@@ -111,8 +115,6 @@ def make_sampler(
             )  # fmt: skip
         if config.tokenizer.success and table.success[episodes].any():
             require_shown(table, episodes.nonzero()[0])
-        frames = cached_frames(table.dataset, config.tokenizer.camera_keys, config.tokenizer.image_size)
-        frames.fill(table.row_numbers(episodes.nonzero()[0]))
         return FrameSampler(
             table, frames, episodes.nonzero()[0], config.tokenizer.cameras, batch_size, seed, config.device
         )
@@ -154,11 +156,9 @@ def make_clip_sampler(
         )  # fmt: skip
     cameras, rows = config.tokenizer.camera_keys, table.row_numbers(episodes)
     depth = cached_depth(dataset, cameras, tokenizer.grid) if config.depth else None
-    if depth is not None and (beyond := float((depth[rows] > FAR).mean())) > FAR_SHARE:
-        logging.warning(
-            "%s: %.0f %% of the depth is beyond %.1f m, and is learnt as if it were there",
-            dataset.root, 100 * beyond, FAR,
-        )  # fmt: skip
+    if depth is not None:
+        depth.fill(rows)
+        warn_of_far(depth, table, episodes)
     tokens = cached_tokens(dataset, cameras, tokenizer)
     tokens.fill(rows)
     context = cached_context(dataset, cameras, tokenizer) if config.context_channels else None
@@ -171,6 +171,16 @@ def make_clip_sampler(
         table, tokens, episodes, config.clip_length, config.from_start, batch_size, seed, config.device,
         depth=depth, context=context, features=features,
     )  # fmt: skip
+
+
+def warn_of_far(depth: LazyRows, table: EpisodeTable, episodes: np.ndarray) -> None:
+    """Say so if much of the depth of these episodes is beyond `FAR`."""
+    beyond = float(np.mean([(depth[rows] > FAR).mean() for rows in table.rows(episodes)]))
+    if beyond > FAR_SHARE:
+        logging.warning(
+            "%s: %.0f %% of the depth is beyond %.1f m, and is learnt as if it were there",
+            table.dataset.root, 100 * beyond, FAR,
+        )  # fmt: skip
 
 
 def make_joint_sampler(

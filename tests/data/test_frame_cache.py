@@ -15,11 +15,12 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.data import frame_cache, lazy_rows
+from lerobot_wmrl.data import frame_cache
 from lerobot_wmrl.data.checks import check_cameras
 from lerobot_wmrl.data.dataset import ChosenEpisodes, TrainingData, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import cached_depth, depth_of_windows, token_depth, unmeasured_depth
+from lerobot_wmrl.data.lazy_rows import LazyRows
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
@@ -76,7 +77,7 @@ def test_what_was_not_measured_does_not_count():
 @pytest.mark.parametrize(("dtype", "unit"), [(np.uint16, 1000), (np.float32, 1)])
 def test_depth_stored_as_images_is_read_in_its_unit(dtype, unit, tmp_path, monkeypatch):
     """A long episode in parts."""
-    monkeypatch.setattr(lazy_rows, "BATCH", 2)
+    monkeypatch.setattr(frame_cache, "DECODED", 2)
     depth_map = {
         "dtype": "image", "shape": (SIZE, SIZE, 1), "names": ["height", "width", "channels"],
         "info": {"is_depth_map": True},
@@ -175,14 +176,15 @@ def test_a_batch_of_lerobot_train_has_the_depth_of_the_cache(deep_dataset, model
 
 
 def test_depth_beyond_the_farthest_is_named_and_compared_as_it_is_learnt(
-    deep_dataset, models, monkeypatch, caplog
+    deep_dataset, models, monkeypatch, caplog, tmp_path
 ):
     model = load_model(models["action_world_model"], "action_world_model")
     table = read_episodes(deep_dataset)
     make_joint_sampler(model, table, TrainingData(str(deep_dataset.root)), batch_size=2, seed=0)
     assert "of the depth is beyond" not in caplog.text
-    depth = np.array(cached_depth(deep_dataset, [CAMERA], model.tokenizer.grid))
-    depth[:, 3] = 4.0
+    far = np.array(cached_depth(deep_dataset, [CAMERA], model.tokenizer.grid))
+    far[:, 3] = 4.0
+    depth = LazyRows(tmp_path / "far", far.shape, np.float32, table.start, lambda rows: far[rows], 9, "")
     for module in ("training_data", "imagination"):
         monkeypatch.setattr(f"lerobot_wmrl.world_models.{module}.cached_depth", lambda *_: depth)
     make_joint_sampler(model, table, TrainingData(str(deep_dataset.root)), batch_size=2, seed=0)

@@ -11,7 +11,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
 from lerobot_wmrl.common.images import stretch
-from lerobot_wmrl.data import frame_cache, lazy_rows
+from lerobot_wmrl.data import frame_cache
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.decoding import decode
 from lerobot_wmrl.data.episodes import read_episodes
@@ -25,8 +25,8 @@ def test_long_episodes_are_decoded_in_parts_to_the_same_frames(
 ) -> None:
     cameras = ["observation.images.third_view"]
     caches = []
-    for part in (lazy_rows.BATCH, 7):
-        monkeypatch.setattr(lazy_rows, "BATCH", part)
+    for part in (frame_cache.DECODED, 7):
+        monkeypatch.setattr(frame_cache, "DECODED", part)
         monkeypatch.setattr(frame_cache, "cache_dir", lambda _, part=part: tmp_path / str(part))
         caches.append(np.array(cached_frames(small_dataset, cameras, 32)))
     np.testing.assert_array_equal(*caches)

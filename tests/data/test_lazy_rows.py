@@ -1,7 +1,10 @@
 """Rows on disk are computed when they are read, once, and go on where that was stopped."""
 
+import errno
+import fcntl
 import os
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,13 +14,15 @@ import pytest
 from lerobot_wmrl.data import lazy_rows
 from lerobot_wmrl.data.lazy_rows import LazyRows
 
-FIRST = np.array([0, 2, 3, 6])
-"""Of units of two, one, three and four rows."""
+STARTS = np.array([0, 2, 3, 6])
+"""Of episodes of two, one, three and four rows."""
 
 Compute = Callable[[np.ndarray], np.ndarray]
 
 
-def rows_at(path: Path, computed: list[int], stop_at: int = -1, by: type = KeyboardInterrupt) -> LazyRows:
+def rows_at(
+    path: Path, computed: list[int], stop_at: int = -1, by: type = KeyboardInterrupt, at_once: int = 4
+) -> LazyRows:
     """Return ten rows, each its number twice, that note which of them were computed."""
 
     def numbers(rows: np.ndarray) -> np.ndarray:
@@ -26,7 +31,7 @@ def rows_at(path: Path, computed: list[int], stop_at: int = -1, by: type = Keybo
         computed.extend(rows.tolist())
         return np.stack([rows, rows], 1)
 
-    return LazyRows(path, (10, 2), np.int32, FIRST, numbers, "Counting")
+    return LazyRows(path, (10, 2), np.int32, STARTS, numbers, at_once, "Counting")
 
 
 class Killed(BaseException):
@@ -57,22 +62,27 @@ def test_what_is_read_is_computed_with_its_unit_and_once(path: Path, index: obje
     assert sorted(computed) == list(range(10))
 
 
+def test_a_long_episode_is_computed_in_parts(path: Path) -> None:
+    computed: list[int] = []
+    assert rows_at(path, computed, at_once=3)[7, 0] == 7
+    assert computed == [6, 7, 8]
+
+
 @pytest.mark.parametrize("by", [KeyboardInterrupt, ValueError])
-def test_what_was_stopped_goes_on(path: Path, monkeypatch: pytest.MonkeyPatch, by: type) -> None:
-    """Whole units stay, a row of the next one does not count."""
-    monkeypatch.setattr(lazy_rows, "BATCH", 2)
+@pytest.mark.parametrize(("at_once", "done"), [(4, 3), (2, 5)])
+def test_what_was_stopped_goes_on(path: Path, by: type, at_once: int, done: int) -> None:
+    """Several episodes are computed at once, or parts of a longer one."""
     computed: list[int] = []
     with pytest.raises(by):
-        rows_at(path, computed, stop_at=5, by=by)[:]
-    assert computed == [0, 1, 2, 3]
+        rows_at(path, computed, stop_at=5, by=by, at_once=at_once)[:]
+    assert computed == list(range(done))
     again: list[int] = []
-    assert rows_at(path, again)[:, 0].tolist() == list(range(10))
-    assert again == [3, 4, 5, 6, 7, 8, 9]
+    assert rows_at(path, again, at_once=at_once)[:, 0].tolist() == list(range(10))
+    assert again == list(range(done, 10))
 
 
 def test_a_killed_process_loses_seconds(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What it has computed is on disk, and noted there."""
-    monkeypatch.setattr(lazy_rows, "BATCH", 3)
     monkeypatch.setattr(lazy_rows, "PROGRESS_SECONDS", 0)
     if not (child := os.fork()):
         rows_at(path, [], stop_at=6, by=Killed)[:]
@@ -83,13 +93,37 @@ def test_a_killed_process_loses_seconds(path: Path, monkeypatch: pytest.MonkeyPa
     assert again == [6, 7, 8, 9]
 
 
-def test_processes_fill_one_file_at_once(path: Path) -> None:
-    """Each sees at once what the other has computed."""
+def test_processes_fill_one_file(path: Path) -> None:
+    """Each sees what the other has computed. One may open the file when the other has just made it."""
+    path.parent.mkdir()
+    path.touch()
     ours: list[int] = []
     theirs: list[int] = []
     first, second = rows_at(path, ours), rows_at(path, theirs)
     first[0], second[3], first[4], second[1]
     assert (ours, theirs) == ([0, 1], [3, 4, 5])
+    np.testing.assert_array_equal(first, second)
+
+
+def test_they_take_turns_where_the_disk_has_locks(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the other process has computed in the meantime is not computed again."""
+    computed: list[int] = []
+    rows, other = rows_at(path, computed), rows_at(path, [])
+    fcntl.flock(other._file.fileno(), fcntl.LOCK_EX)
+    reader = threading.Thread(target=lambda: rows[0:4])
+    reader.start()
+    other._fill(np.array([0, 1]))
+    reader.join(0.2)
+    assert computed == []
+    fcntl.flock(other._file.fileno(), fcntl.LOCK_UN)
+    reader.join()
+    assert computed == [3, 4, 5]
+
+    def refused(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr("fcntl.flock", refused)
+    assert rows[9, 0] == 9
 
 
 def test_nobody_writes_into_what_is_read(path: Path) -> None:

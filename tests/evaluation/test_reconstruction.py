@@ -42,7 +42,9 @@ def test_psnr_is_that_of_each_camera_and_of_its_moved_pixels(dataset, output_dir
     model, table = load_model(output_dir, "frame_tokenizer"), read_episodes(dataset)
     frames = np.array(cached_frames(dataset, model.config.tokenizer.camera_keys, 32))
     frames[:, 1] = frames[table.start[4], 1]
-    still = LazyRows(tmp_path / "rows", frames.shape, np.uint8, table.start, lambda rows: frames[rows], "")
+    still = LazyRows(
+        tmp_path / "rows", frames.shape, np.uint8, table.start, lambda rows: frames[rows], 64, ""
+    )
     metrics = reconstruction_metrics(model, table, still, np.array([4]))
     rows = slice(table.start[4], table.start[4] + table.length[4])
     real = frames_to_tensor(frames[rows])
