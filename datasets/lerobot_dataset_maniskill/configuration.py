@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import draccus
+import numpy as np
 from huggingface_hub.errors import HFValidationError
 from huggingface_hub.utils import validate_repo_id
 from lerobot.configs.policies import PreTrainedConfig
@@ -23,7 +24,7 @@ from lerobot_wmrl.common.policy_checks import require_trained
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.maniskill.embodiment import ACTION_NAMES, STATE_NAMES
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, FPS, STATE_NAMES
 from lerobot_wmrl.maniskill.tasks import task_of
 
 LOCAL = "local"
@@ -103,7 +104,7 @@ class RecordConfig(RunConfig):
     """Episodes per sub-dataset. An interruption costs each worker at most one sub-dataset."""
 
     shard: str = "0/1"
-    """i/n: on the i-th (from 0) of n machines, record every n-th sub-dataset."""
+    """i/n: on the i-th (from 0) of n machines, record the i-th of n parts of the sub-datasets."""
 
     merge_shards: list[Path] = field(default_factory=list)
     """Folders of all shards: merge them into output_dir, and stop."""
@@ -172,6 +173,8 @@ class RecordConfig(RunConfig):
             self._validate_rollouts()
         else:
             self.env.selected_scenes()
+            if self.like.given:
+                self._refuse_like("leave it out")
         for task in self.tasks:
             task_of(task)
 
@@ -195,8 +198,14 @@ class RecordConfig(RunConfig):
                 "env.dataset.root", "", "the episodes that imagined ones begin in are recorded with them",
                 "give a dataset in place of `env.dataset.frames` and `env.dataset.resets`",
             )  # fmt: skip
+        if self.like.given and not self.elsewhere:
+            self._refuse_like("give `video` as a recording to merge it with has it, and leave this out")
         if self.elsewhere and self.shard_of[1] > 1:
             raise FieldError("shard", self.shard, "divides recordings in ManiSkill alone", "leave it out")
+
+    def _refuse_like(self, remedy: str) -> None:
+        problem = "episodes of ManiSkill's robot have columns of their own"
+        raise FieldError("like.root", self.like.name, problem, remedy)
 
     def _validate_kinds(self) -> None:
         planned = [kind for kind in KINDS if kind != POLICY]
@@ -239,7 +248,9 @@ class RecordConfig(RunConfig):
             from lerobot_wmrl.world_models.checkpoint import read_config
 
             robot = read_config(self.env.world_model_path, "action_world_model").embodiment
-            return (robot.action_names, robot.state_names) != (list(ACTION_NAMES), list(STATE_NAMES))
+            same_names = (robot.action_names, robot.state_names) == (list(ACTION_NAMES), list(STATE_NAMES))
+            same_range = np.allclose([robot.action_low, robot.action_high], [ACTION_LOW, ACTION_HIGH])
+            return not (same_names and robot.fps == FPS and same_range)  # a resampled one has other actions
         return not isinstance(self.env, WmrlManiSkillEnv)
 
     @property

@@ -18,6 +18,7 @@ Running the same command again continues an interrupted recording, or reports th
 import importlib.resources
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_wmrl.common.command_line import chosen_types, run_command
@@ -27,16 +28,26 @@ from lerobot_wmrl.common.presets import format_flags, read_settings
 from lerobot_wmrl.common.settings import settings_of
 from lerobot_wmrl.maniskill.scenes import describe_scenes
 
+MANISKILL: Final = RecordConfig().env.type
+"""The environment that is recorded in unless another is given."""
+
+IN_MANISKILL: Final = ("tasks", "kinds", "depth", "shard", "num_workers")
+"""Settings of a recipe that say something of ManiSkill alone."""
+
 
 def expand_recipes(argv: Sequence[str]) -> list[str]:
-    """Replace `--recipe=FILE`, and `--preset=NAME` (a recipe of this package), by their flags in place."""
+    """Replace `--recipe=FILE`, and `--preset=NAME` (a recipe of this package), by their flags in place.
+
+    With another environment than the recipe's, what it says of its own is left out.
+    """
     expanded: list[str] = []
+    kind = chosen_types(argv).get("env")
     for argument in argv:
         name, _, value = argument.partition("=")
         if name == "--recipe":
-            expanded += recipe_flags(Path(value))
+            expanded += recipe_flags(Path(value), kind)
         elif name == "--preset":
-            expanded += recipe_flags(packaged_recipe(value))
+            expanded += recipe_flags(packaged_recipe(value), kind)
         else:
             expanded.append(argument)
     return expanded
@@ -51,8 +62,9 @@ def packaged_recipe(name: str) -> Path:
     return folder / f"{name}.yaml"
 
 
-def recipe_flags(path: Path) -> list[str]:
-    """Return the file's keys as flags. Raises ValueError if it cannot be read, or names an unknown key."""
+def recipe_flags(path: Path, env: str | None = None) -> list[str]:
+    """Return the file's keys as flags, of an environment `env` those that it has too, if it is another one.
+    Raises ValueError if the file cannot be read, or names an unknown key."""
     try:
         settings = read_settings(path, whole=("kinds",))
     except ValueError as error:
@@ -66,7 +78,10 @@ def recipe_flags(path: Path) -> list[str]:
             beside = sorted(each.rpartition(".")[2] for each in known if each.rpartition(".")[0] == prefix)
             hint = suggestion(key, beside, prefix and f"{prefix}.") if beside else "see --help"
             raise ValueError(f"--recipe={path}: the key {name} is unknown; {hint}")
-    return flags
+    if env in (None, settings.get("env.type", MANISKILL)):
+        return flags
+    shared = {name: value for name, value in settings.items() if not name.startswith(("env.", *IN_MANISKILL))}
+    return format_flags(shared)
 
 
 def run(config: RecordConfig) -> None:

@@ -5,7 +5,7 @@ import json
 import logging
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -128,7 +128,7 @@ def run_command[Config: RunConfig](
     logging.getLogger("lerobot.configs").setLevel(logging.ERROR)
     try:
         typed = with_home(with_equals_signs(sys.argv[1:]))
-        sys.argv[1:] = with_texts_as_typed(expand(typed), config_class)
+        sys.argv[1:] = with_texts_as_typed(with_default_types(expand(typed), config_class), config_class)
         if {"--help", "-h"} & set(sys.argv[1:]):
             print(help_of(function, config_class))
             return
@@ -161,6 +161,13 @@ def with_equals_signs(argv: Sequence[str]) -> list[str]:
         else:
             written.append(argument)
     return written
+
+
+def with_default_types(argv: Sequence[str], config_class: type) -> list[str]:
+    """Say the default type of what settings were typed of, which draccus asks for: `--env.type=…`."""
+    settings = settings_of(config_class, chosen_types(argv))
+    defaults = {each.name: each.default for each in settings if each.name.endswith(TYPE)}
+    return [*argv, *(f"--{kind}={defaults[kind]}" for _, kind in untyped(defaults, argv) if defaults[kind])]
 
 
 def with_texts_as_typed(argv: Sequence[str], config_class: type) -> list[str]:
@@ -245,8 +252,9 @@ def parsing_error(message: str, config_class: type[RunConfig]) -> str:
         group, reason = ".".join(filter(None, (group, inner[1]))), inner[2]
     settings = list(settings_of(config_class, chosen_types(sys.argv[1:])))
     if "Expected a dict with a 'type' key" in reason:
+        kinds = [each.name for each in settings if each.name.endswith(TYPE)]
         return "; ".join(
-            f"--{flag} is a setting of a type: give --{kind}=…" for flag, kind in untyped(settings)
+            f"--{flag} is a setting of a type: give --{kind}=…" for flag, kind in untyped(kinds, sys.argv[1:])
         )
     unknown = re.findall(r"--([\w.-]+)", reason) if reason.startswith("unrecognized arguments") else []
     if invalid := re.match(r"The fields? (.*) (?:is|are) not valid for", reason):
@@ -257,10 +265,13 @@ def parsing_error(message: str, config_class: type[RunConfig]) -> str:
     return "; ".join(problems) or " ".join(f"{f'--{group}: ' if group else ''}{reason}".split())
 
 
-def untyped(settings: Sequence[Setting]) -> Iterator[tuple[str, str]]:
-    """Yield the flags that were typed although the type that they belong to was not, each with that flag."""
-    typed, chosen = typed_flags(sys.argv[1:]), chosen_types(sys.argv[1:])
-    for group in (each.name.removesuffix(TYPE) for each in settings if each.name.endswith(TYPE)):
+def untyped(kinds: Iterable[str], argv: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield flags that were typed although the type that they belong to was not, each with the type's flag.
+
+    kinds: names of the flags for types.
+    """
+    typed, chosen = typed_flags(argv), chosen_types(argv)
+    for group in (each.removesuffix(TYPE) for each in kinds):
         flag = next((name for name in typed if name.startswith(f"{group}.")), None)
         if flag and group not in chosen and f"{group}.path" not in typed:
             yield flag, f"{group}{TYPE}"

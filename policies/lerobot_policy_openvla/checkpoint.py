@@ -37,6 +37,9 @@ COMPANIONS: Final = (
 )  # fmt: skip
 """Small files beside the weights, kept as they are."""
 
+RELEASE: Final = "openvla/openvla-7b"
+"""The released checkpoint, whose folder on the hub holds OpenVLA's code."""
+
 VIT_IDS: Final = {DINO: "vit_large_patch14_reg4_dinov2.lvd142m", SIGLIP: "vit_so400m_patch14_siglip_224"}
 SUPPORTED: Final = {
     "image_resize_strategy": "resize-naive", "use_fused_vision_backbone": True, "n_action_bins": BINS,
@@ -208,9 +211,21 @@ def write_openvla(
     if not {sizes.dino.width, sizes.siglip.width} <= RELEASED_HEADS.keys():
         files.setdefault(VIT_FILE, _json(vit_overrides(sizes)))
     files |= {CONFIG_FILE: _json(config), STATISTICS_FILE: _json({**known, **changed})}
-    for name, content in files.items():
+    for name, content in with_released_code(files).items():
         (folder / name).write_bytes(content)
     save_torch_state_dict(dict(weights), folder, max_shard_size=MAX_SHARD)
+
+
+def with_released_code(files: Files) -> Files:
+    """Let `auto_map` name the code of the release on the hub: it names Python files beside a checkpoint, of
+    which there are none here, and transformers looks for them with `trust_remote_code`, as OpenVLA does."""
+    mapped = {name: json.loads(content) for name, content in files.items() if b'"auto_map"' in content}
+    for content in mapped.values():
+        content["auto_map"] = {
+            kind: each if not isinstance(each, str) or "--" in each else f"{RELEASE}--{each}"
+            for kind, each in content["auto_map"].items()
+        }
+    return {**files, **{name: _json(content) for name, content in mapped.items()}}
 
 
 def changed_statistics(norm_stats: NormStats, known: NormStats) -> NormStats:

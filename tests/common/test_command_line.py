@@ -16,6 +16,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 from lerobot.robots import RobotConfig
 
+from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_wmrl import scripts
 from lerobot_wmrl.common.command_line import (
     GivenPath,
@@ -24,6 +25,7 @@ from lerobot_wmrl.common.command_line import (
     parse_flags,
     run_command,
     said_in_flags,
+    with_default_types,
     with_equals_signs,
     with_home,
     with_texts_as_typed,
@@ -114,8 +116,8 @@ def test_a_flag_that_does_not_exist_leads_to_one_that_does(name: str, near: str 
     [
         (["--steps=3"], "there is no flag --steps: did you mean --iterations?"),
         (
-            ["--env.type=world_model", "--env.reward.form=absolute"],
-            "--env.reward.form is a setting of a type: give --env.reward.type=…",
+            ["--env.type=world_model", "--real_env.episode_length=9"],
+            "--real_env.episode_length is a setting of a type: give --real_env.type=…",
         ),
         (
             ["--env.type=world_model", "--env.robot_mesh_detail=1"],
@@ -140,6 +142,19 @@ def test_what_cannot_be_parsed_is_said_in_one_line(
         parse_flags(TrainConfig)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("command", "flags", "added"), [
+    (RecordConfig, ["--env.image_size=33"], ["--env.type=wmrl_maniskill"]),
+    (TrainConfig, ["--algorithm.policy_lr=1e-4"], ["--algorithm.type=ppo"]),
+    (TrainConfig, ["--env.type=world_model", "--env.reward.alpha=1"], ["--env.reward.type=general"]),
+    (TrainConfig, ["--env.type=world_model", "--env.reward.type=embedding", "--env.reward.alpha=1"], []),
+    (TrainConfig, ["--real_env.episode_length=9", "--policy.path=x", "--policy.device=cpu"], []),
+])  # fmt: skip
+def test_a_default_type_need_not_be_typed(
+    command: type[RunConfig], flags: list[str], added: list[str]
+) -> None:
+    assert with_default_types(flags, command) == [*flags, *added]
 
 
 def test_what_is_said_of_a_checkpoint_is_noted_where_flags_are_parsed(

@@ -1,6 +1,8 @@
 """Imagined episodes, recorded as a LeRobotDataset: no simulator."""
 
 import itertools
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,9 +19,10 @@ from lerobot_dataset_maniskill.recorder import record
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
+from lerobot_wmrl.common.checkpoints import model_folder
 from lerobot_wmrl.common.constants import KINDS, START_KIND, START_SCENE, START_SEED, START_TASK
 from lerobot_wmrl.common.policies import read_policy_config
-from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
@@ -70,6 +73,27 @@ def test_every_row_is_what_the_world_model_imagined(config, small_dataset):
     ends = np.arange(1, 7 * LENGTH + 1) % LENGTH == 0
     truncated = dataset.hf_dataset.with_format("numpy")["next.truncated"][:].reshape(-1)
     assert np.array_equal(truncated, ends)
+
+
+@pytest.mark.parametrize("changed", [{"fps": 5}, {"action_high": [0.25] * 7}])
+def test_a_resampled_robot_of_the_same_name_is_another_one(config, changed, trained_models, tmp_path):
+    """Its actions are larger, and it takes fewer a second."""
+    assert not config.elsewhere
+    model = shutil.copytree(model_folder(trained_models["action_world_model"]), tmp_path / "resampled")
+    stored = json.loads((model / "config.json").read_text())
+    stored["embodiment"] |= changed
+    (model / "config.json").write_text(json.dumps(stored))
+    config.env = replace(config.env, world_model_path=str(model), fps=0)
+    assert config.elsewhere
+
+
+def test_columns_of_other_data_are_refused_for_maniskills_robot(config, small_dataset):
+    config.like = DatasetSource(str(small_dataset.root))
+    with pytest.raises(ValueError, match=r"^like\.root=.*columns of their own; give `video` as"):
+        record(config)
+    simulated = RecordConfig(output_dir=config.output_dir, num_episodes=1, like=config.like)
+    with pytest.raises(ValueError, match=r"^like\.root=.*columns of their own; leave it out"):
+        record(simulated)
 
 
 def test_an_episode_ends_with_the_k_frame_done(config):

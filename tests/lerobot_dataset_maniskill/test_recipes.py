@@ -40,6 +40,16 @@ def test_a_recipe_may_hold_any_flag_of_the_command(text: str, recipe: Callable[[
     assert recipe_flags(recipe(text))
 
 
+@pytest.mark.parametrize("stated", ["", "type: wmrl_maniskill, "])
+def test_what_a_recipe_says_of_its_environment_is_left_out_with_another(
+    stated: str, recipe: Callable[[str], Path]
+) -> None:
+    path = recipe(f"tasks: [push, pull]\nenv: {{{stated}image_size: 32}}\nseed: 3\nkinds: {{optimal: 1}}")
+    flags = [f"--recipe={path}", "--env.type=pusht"]
+    assert expand_recipes(flags) == ["--seed=3", "--env.type=pusht"]
+    assert len(expand_recipes([flags[0], "--env.type=wmrl_maniskill"])) == 5 + bool(stated)
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_every_packaged_recipe_plans_only_what_training_may_see(size: str, tmp_path: Path) -> None:
     arguments = [*expand_recipes([f"--preset={size}"]), f"--output_dir={tmp_path / 'dataset'}"]

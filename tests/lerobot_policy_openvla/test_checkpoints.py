@@ -58,6 +58,20 @@ def test_weights_come_out_as_they_went_in(checkpoint: Path, tmp_path: Path, shar
         assert json.loads(after) == json.loads(before)
 
 
+def test_code_that_is_not_exported_is_that_of_the_release(checkpoint: Path, tmp_path: Path) -> None:
+    """Transformers looks for the files that auto_map names in the folder, and finds none."""
+    for file, code in (("config.json", "modeling.Net"), ("processor_config.json", "some/fork--processing.P")):
+        stored = json.loads((checkpoint / file).read_text()) if (checkpoint / file).exists() else {}
+        (checkpoint / file).write_text(json.dumps({**stored, "auto_map": {"Auto": code}}))
+    policy = OpenVLAPolicy.from_openvla(checkpoint, unnorm_key="two")
+    sizes, statistics = policy.config.sizes, policy.config.norm_stats
+    write_openvla(tmp_path / "out", policy.model.state_dict(), sizes, policy.files, statistics)
+    files = (tmp_path / "out" / name for name in ("config.json", "processor_config.json"))
+    found = [json.loads(file.read_text()) for file in files]
+    named = ["openvla/openvla-7b--modeling.Net", "some/fork--processing.P"]
+    assert [each["auto_map"]["Auto"] for each in found] == named
+
+
 def test_sizes_and_answers_are_those_of_the_model(checkpoint: Path) -> None:
     assert OpenVLACheckpoint.open(checkpoint).sizes == SMALL_SIZES
     policy = OpenVLAPolicy.from_openvla(checkpoint, unnorm_key="one")
