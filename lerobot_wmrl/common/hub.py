@@ -23,6 +23,16 @@ def cached_repo(folder: Path) -> str | None:
     return folder.parents[1].name if folder.parent.name == "snapshots" else None
 
 
+def published_name(path: str | Path) -> tuple[str, str | None] | None:
+    """Return the name of a model on the hub, and its revision if it is one in the hub's cache; None of a
+    folder that nobody else has."""
+    folder = Path(path)
+    if not folder.exists():
+        return str(path), None
+    kind, _, name = (cached_repo(folder) or "").partition("--")
+    return (name.replace("--", "/", 1), folder.name) if kind == "models" else None
+
+
 def check_login() -> None:
     """Raise FieldError about `push_to_hub` if nobody is logged in to the hub."""
     if get_token() is None:

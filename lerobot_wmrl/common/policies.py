@@ -24,6 +24,7 @@ from lerobot_wmrl.common.checkpoints import (
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.files import whole_folder
+from lerobot_wmrl.common.hub import published_name
 
 
 def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
@@ -160,7 +161,11 @@ def with_new_adapters(policy: Any, settings: AdapterSettings) -> Any:
     """Add adapters to a policy as lerobot-train does. Raises FieldError if it has some already."""
     if has_adapters(policy):
         raise FieldError("peft", None, "the policy has adapters, which are trained further; leave it out")
-    return policy.wrap_with_peft(peft_cli_overrides=asdict(settings))
+    adapted = policy.wrap_with_peft(peft_cli_overrides=asdict(settings))
+    if published := published_name(str(policy.config.pretrained_path)):
+        adapter = adapted.peft_config[adapted.active_adapter]
+        adapter.base_model_name_or_path, adapter.revision = published
+    return adapted
 
 
 def load_with_adapters(config: PreTrainedConfig, **options: Any) -> Any:

@@ -13,6 +13,7 @@ from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, within
+from lerobot_wmrl.common.hub import published_name
 from lerobot_wmrl.rl.configuration_algorithms import AlgorithmConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
 
@@ -147,7 +148,7 @@ def require_published_base(cfg: TrainConfig, policy: PreTrainedConfig) -> None:
     base = policy.pretrained_path if cfg.peft is not None else None
     if policy.use_peft:
         base = adapter_config(policy).base_model_name_or_path
-    if base is not None and Path(base).exists():
+    if base is not None and published_name(base) is None:
         raise FieldError(
             "policy.push_to_hub", True, f"the adapters belong to the policy in {base}, which nobody else has",
             "publish that one, and give its name on the hub: with new adapters as `policy.path`, else in "

@@ -97,19 +97,19 @@ def publish(cfg: TrainConfig, lines: list[str]) -> None:
         return
     from huggingface_hub import HfApi
 
-    from lerobot_wmrl.common.hub import create_repo, publishing
+    from lerobot_wmrl.common.hub import create_repo, published_name, publishing
     from lerobot_wmrl.world_models.hub_card import card_metadata
 
     api = HfApi()
     described = [lines[0].removeprefix(f"{cfg.output_dir}: "), *lines[1:-1]]
-    description, start = "\n".join(f"- {line}" for line in described), str(config.pretrained_path)
+    description, start = "\n".join(f"- {line}" for line in described), published_name(config.pretrained_path)
     kept = f"the policy is whole in {cfg.output_dir}, the same command again only publishes it"
     with within("policy"), publishing(config.repo_id, kept), TemporaryDirectory() as temporary:
         name = create_repo(api, config.repo_id, config.private)
         card = CARD.format(
             metadata=card_metadata(config, model_name=name).to_yaml(), name=name, type=config.type,
             description=description,
-            start="a policy that is not published" if Path(start).exists() else f"`{start}`",
+            start=f"`{'@'.join(filter(None, start))}`" if start else "a policy that is not published",
             command=evaluation(cfg, name, shared=True),
         )  # fmt: skip
         folder = Path(temporary) / "policy"

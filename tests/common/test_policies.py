@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from lerobot.configs.default import PeftConfig
 from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.processor import PolicyProcessorPipeline, UnnormalizerProcessorStep
 from safetensors.torch import load_file, save_model
@@ -12,12 +13,14 @@ from safetensors.torch import load_file, save_model
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.checkpoints import link_checkpoint
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.hub import published_name
 from lerobot_wmrl.common.policies import (
     check_weights,
     copy_checkpoint,
     load_policy,
     load_trained_weights,
     read_policy_config,
+    with_new_adapters,
 )
 from lerobot_wmrl.common.policy_checks import check_fit, check_units
 from tests.hub_server import Hub, Repo
@@ -57,6 +60,13 @@ def test_of_a_revision_on_the_hub_all_is_loaded_from_there(hub: Hub, tmp_path: P
         wanted = CnnPolicy.from_pretrained(folder).state_dict()
         assert all(torch.equal(value, wanted[name]) for name, value in loaded.items())
     assert second == repo.refs["main"]
+    pinned = load_policy(read_policy_config("someone/policy", [f"--pretrained_revision={first}"]))
+    settings = PeftConfig(method_type="LORA", target_modules=["project"], r=2)
+    adapters = with_new_adapters(pinned, settings).peft_config["default"]
+    assert (adapters.base_model_name_or_path, adapters.revision) == ("someone/policy", first)
+    assert published_name(str(pinned.config.pretrained_path)) == ("someone/policy", first)
+    assert published_name("someone/policy") == ("someone/policy", None)
+    assert published_name(str(saved[0])) is None
     with pytest.raises(FieldError, match=r"^policy\.pretrained_revision=abc: .* is a folder"):
         read_policy_config(str(saved[0]), ["--pretrained_revision=abc"])
 

@@ -57,6 +57,12 @@ def test_episodes_that_nobody_reads_are_not_decoded(
         make_sampler(model, read_episodes(small_dataset), [2], batch_size=2, seed=0)
 
 
+def test_episodes_whose_rows_are_out_of_order_are_refused() -> None:
+    meta = SimpleNamespace(episodes={"dataset_from_index": [0, 9, 5]})
+    with pytest.raises(ValueError, match=r"^dataset\.root=here: its episodes' rows do not follow each other"):
+        frame_cache.episode_starts(SimpleNamespace(meta=meta, root="here"))  # type: ignore[arg-type]
+
+
 def test_caches_lie_beside_the_dataset_wherever_a_command_is_called(
     small_dataset: LeRobotDataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,7 +12,7 @@ from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.data.lazy_rows import LazyRows
 from lerobot_wmrl.evaluation import reconstruction
 from lerobot_wmrl.evaluation.image_metrics import psnr_from_mse
-from lerobot_wmrl.evaluation.reconstruction import code_use, reconstruction_metrics
+from lerobot_wmrl.evaluation.reconstruction import code_use, reconstruction_metrics, write_reconstruction
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.codebook import BinaryCodeBook, CodeBook
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig, TokenizerConfig
@@ -71,6 +71,15 @@ def test_the_training_of_a_tokenizer_ends_with_the_held_out_episodes(dataset, ou
     assert report["psnr"].keys() == set(CAMERAS)
     assert report["codes"]["size"] == 20
     assert [factor["size"] for factor in report["code_factors"]] == [5, 4]
+
+
+@pytest.mark.parametrize(("chosen", "split", "measured"), [
+    ([0, 2], "all", [0, 2]), ([0, 19], "validation", [19]),
+])  # fmt: skip
+def test_episodes_that_were_not_chosen_do_not_count(dataset, output_dir, tmp_path, chosen, split, measured):
+    model, table = load_model(output_dir, "frame_tokenizer"), read_episodes(dataset)
+    report = write_reconstruction(model, table, tmp_path, chosen)
+    assert (report["split"], report["frames"]) == (split, table.length[measured].sum())
 
 
 def test_where_no_episode_is_held_out_it_says_so(trained_models):

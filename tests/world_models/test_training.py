@@ -127,6 +127,7 @@ def test_held_out_losses_are_the_same_again(kind, small_dataset, trained_models,
     first = held_out_metrics(model, table, 2)
     torch.rand(1)
     assert held_out_metrics(model, table, 2) == first
+    assert held_out_metrics(model, table, 2, chosen=[1, 3]) == {}, "none of these is held out"
     model.train()(clip, 0.0)
     assert corrupted == [True]
 
