@@ -248,9 +248,10 @@ class RecordConfig(RunConfig):
             from lerobot_wmrl.world_models.checkpoint import read_config
 
             robot = read_config(self.env.world_model_path, "action_world_model").embodiment
-            same_names = (robot.action_names, robot.state_names) == (list(ACTION_NAMES), list(STATE_NAMES))
+            if (robot.action_names, robot.state_names) != (list(ACTION_NAMES), list(STATE_NAMES)):
+                return True
             same_range = np.allclose([robot.action_low, robot.action_high], [ACTION_LOW, ACTION_HIGH])
-            return not (same_names and robot.fps == FPS and same_range)  # a resampled one has other actions
+            return not (robot.fps == FPS and same_range)  # that of resampled data takes larger actions
         return not isinstance(self.env, WmrlManiSkillEnv)
 
     @property

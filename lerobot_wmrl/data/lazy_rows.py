@@ -108,11 +108,10 @@ class LazyRows:
                 self._record(unrecorded)
 
     def _record(self, units: list[int]) -> None:
-        """Write to disk what was computed, then that it is there."""
+        """Write to disk what was computed, before the file says that it is there."""
         if units:
             self._values.flush()
             self._done[units] = 1
-            self._done.flush()
 
     def _reserve(self, units: np.ndarray) -> None:
         """Reserve room for units: a full disk says so now, and not by a bus error later."""

@@ -12,8 +12,9 @@ import torch
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.dataset import ChosenEpisodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
 from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
+from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
@@ -119,7 +120,7 @@ def test_a_truncated_checkpoint_is_named(trained_models, tmp_path):
         load_model(tmp_path, "frame_tokenizer")
 
 
-def test_a_corrupted_episode_file_is_named_and_leaves_nothing(small_dataset, tmp_path):
+def test_a_corrupted_episode_file_is_named_and_may_be_copied_again(small_dataset, tmp_path):
     root = tmp_path / "dataset"
     shutil.copytree(small_dataset.root, root)
     video = next(root.rglob("*.mp4"))
@@ -127,7 +128,11 @@ def test_a_corrupted_episode_file_is_named_and_leaves_nothing(small_dataset, tmp
     with pytest.raises(ValueError, match=rf"episode \d+: .*{video.name} cannot be decoded .*record it again"):
         train_tokenizer(root, tmp_path / "run", steps=1)
     assert not (tmp_path / "run").exists()
-    assert not list(tmp_path.rglob("frames-*"))
+    shutil.copy(Path(small_dataset.root) / video.relative_to(root), video)
+    train_tokenizer(root, tmp_path / "run", steps=1)
+    keys = ["observation.images.third_view"]
+    frames = [cached_frames(open_dataset(each), keys, 32) for each in (root, small_dataset.root)]
+    np.testing.assert_array_equal(*frames)
 
 
 @pytest.mark.parametrize(("pattern", "message"), [
