@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lerobot_wmrl.data import lazy_rows
-from lerobot_wmrl.data.lazy_rows import LazyRows
+from lerobot_wmrl.data.lazy_rows import LazyRows, opened
 
 STARTS = np.array([0, 2, 3, 6])
 """Of episodes of two, one, three and four rows."""
@@ -103,6 +103,12 @@ def test_processes_fill_one_file(path: Path) -> None:
     first[0], second[3], first[4], second[1]
     assert (ours, theirs) == ([0, 1], [3, 4, 5])
     np.testing.assert_array_equal(first, second)
+
+
+def test_a_file_is_as_long_as_it_becomes_at_once(tmp_path: Path) -> None:
+    """Numpy would lengthen it by a zero at its end, over what another process may have written there."""
+    opened(tmp_path / "new" / "rows", 100).close()
+    assert (tmp_path / "new" / "rows").stat().st_size == 100
 
 
 def test_they_take_turns_where_the_disk_has_locks(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
