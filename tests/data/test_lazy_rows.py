@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lerobot_wmrl.data import lazy_rows
-from lerobot_wmrl.data.lazy_rows import LazyRows, opened
+from lerobot_wmrl.data.lazy_rows import LazyRows, groups, opened
 
 STARTS = np.array([0, 2, 3, 6])
 """Of episodes of two, one, three and four rows."""
@@ -103,6 +103,11 @@ def test_processes_fill_one_file(path: Path) -> None:
     first[0], second[3], first[4], second[1]
     assert (ours, theirs) == ([0, 1], [3, 4, 5])
     np.testing.assert_array_equal(first, second)
+
+
+def test_short_episodes_are_computed_several_at_once() -> None:
+    assert [*groups(np.array([2, 1, 3, 4, 1]), 4)] == [slice(0, 2), slice(2, 3), slice(3, 4), slice(4, 5)]
+    assert [*groups(np.array([], int), 4)] == []
 
 
 def test_a_file_is_as_long_as_it_becomes_at_once(tmp_path: Path) -> None:
