@@ -164,7 +164,12 @@ def with_equals_signs(argv: Sequence[str]) -> list[str]:
 
 
 def with_default_types(argv: Sequence[str], config_class: type) -> list[str]:
-    """Say the default type of what settings were typed of, which draccus asks for: `--env.type=…`."""
+    """Say the default type of what settings were typed of, which draccus asks for: `--env.type=…`.
+
+    Not beside a configuration in a folder or on the hub, which says the types itself.
+    """
+    if (stored := typed_flags(argv).get("config_path")) and not is_file(stored):
+        return list(argv)
     settings = settings_of(config_class, chosen_types(argv))
     defaults = {each.name: each.default for each in settings if each.name.endswith(TYPE)}
     return [*argv, *(f"--{kind}={defaults[kind]}" for _, kind in untyped(defaults, argv) if defaults[kind])]

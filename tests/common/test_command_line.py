@@ -150,6 +150,7 @@ def test_what_cannot_be_parsed_is_said_in_one_line(
     (TrainConfig, ["--env.type=world_model", "--env.reward.alpha=1"], ["--env.reward.type=general"]),
     (TrainConfig, ["--env.type=world_model", "--env.reward.type=embedding", "--env.reward.alpha=1"], []),
     (TrainConfig, ["--real_env.episode_length=9", "--policy.path=x", "--policy.device=cpu"], []),
+    (TrainConfig, ["--config_path=user/policy", "--algorithm.policy_lr=1e-4"], []),
 ])  # fmt: skip
 def test_a_default_type_need_not_be_typed(
     command: type[RunConfig], flags: list[str], added: list[str]
