@@ -24,7 +24,7 @@ from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_wmrl.common.command_line import chosen_types, run_command
 from lerobot_wmrl.common.errors import renamed, suggestion
 from lerobot_wmrl.common.files import writing
-from lerobot_wmrl.common.presets import format_flags, read_settings
+from lerobot_wmrl.common.presets import format_flags, read_settings, without_other_types
 from lerobot_wmrl.common.settings import settings_of
 from lerobot_wmrl.maniskill.scenes import describe_scenes
 
@@ -80,8 +80,8 @@ def recipe_flags(path: Path, env: str | None = None) -> list[str]:
             raise ValueError(f"--recipe={path}: the key {name} is unknown; {hint}")
     if env in (None, settings.get("env.type", MANISKILL)):
         return flags
-    shared = {name: value for name, value in settings.items() if not name.startswith(("env.", *IN_MANISKILL))}
-    return format_flags(shared)
+    shared = without_other_types({"env.type": MANISKILL, **settings}, {"env.type": env})
+    return format_flags({name: value for name, value in shared.items() if name not in IN_MANISKILL})
 
 
 def run(config: RecordConfig) -> None:

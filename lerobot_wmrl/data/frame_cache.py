@@ -26,12 +26,9 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.hub import cached_repo
 from lerobot_wmrl.common.images import from_bytes, stretch
 from lerobot_wmrl.data.checks import depth_key
-from lerobot_wmrl.data.decoding import decode, decode_depth
+from lerobot_wmrl.data.decoding import DECODED, decode, decode_depth
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.data.lazy_rows import LazyRows
-
-DECODED: Final = 256
-"""Frames that are decoded at once: those of a long episode would not fit into the memory."""
 
 ENCODED: Final = 128
 """Frames that are encoded at once."""
@@ -251,15 +248,7 @@ def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int)
 
     starts, shape = episode_starts(dataset), (dataset.num_frames, len(keys) * grid**2)
     path = cache_dir(dataset) / f"depth-{key}.rows"
-    return LazyRows(
-        path,
-        shape,
-        np.float32,
-        starts,
-        decoded,
-        DECODED,
-        "Decoding depth",
-    )
+    return LazyRows(path, shape, np.float32, starts, decoded, DECODED, "Decoding depth")
 
 
 def unmeasured_depth(features: Mapping[str, Any], camera_keys: Sequence[str]) -> list[float]:

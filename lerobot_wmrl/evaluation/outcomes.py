@@ -226,7 +226,6 @@ def seen_outcomes(
     if not isinstance(done, PredictedSuccess) or not table.has_labels:
         return None
     features = cached_features(table.dataset, model.config.tokenizer.camera_keys, model.tokenizer)
-
     features.fill(table.row_numbers(episodes))
 
     def judged(episode: int) -> PredictedDone:

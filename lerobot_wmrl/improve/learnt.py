@@ -81,16 +81,19 @@ class LearntEpisodes:
         """
         config, findings = self.plan.config, self.plan.findings
         dataset, holds_out = config.dataset.flags(), findings.held_out >= ENOUGH_HELD_OUT
+        numbers = list(self.plan.rollout_numbers())
+        rollouts = replace(self.plan.data, episodes=numbers).flags()
+        success = validation = np.zeros(0, bool)  # of the rollouts, if there are enough
+        if len(numbers) >= ENOUGH_HELD_OUT:
+            success, validation = self.table.success[numbers], self.table.validation[numbers]
         choices = [
+            (
+                validation.sum() >= ENOUGH_HELD_OUT and tell_apart(success[validation]),
+                (rollouts, "validation"),
+            ),
             (holds_out and findings.held_out_tell, (dataset, "validation")),
+            (tell_apart(success), (rollouts, "all")),
             (findings.failures > 0 and findings.success_frames > 0, (dataset, "all")),
         ]
-        if config.rollouts >= ENOUGH_HELD_OUT:
-            table, numbers = self.table, list(self.plan.rollout_numbers())
-            success, validation = table.success[numbers], table.validation[numbers]
-            rollouts = replace(self.plan.data, episodes=numbers).flags()
-            enough = validation.sum() >= ENOUGH_HELD_OUT
-            choices.insert(0, (enough and tell_apart(success[validation]), (rollouts, "validation")))
-            choices.insert(2, (tell_apart(success), (rollouts, "all")))
         unknown = dataset, "validation" if holds_out else "all"
         return next((choice for possible, choice in choices if possible), unknown)
