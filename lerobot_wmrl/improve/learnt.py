@@ -83,7 +83,8 @@ class LearntEpisodes:
         dataset, holds_out = config.dataset.flags(), findings.held_out >= ENOUGH_HELD_OUT
         numbers = list(self.plan.rollout_numbers())
         rollouts = replace(self.plan.data, episodes=numbers).flags()
-        success = validation = np.zeros(0, bool)  # of the rollouts, if there are enough
+        success: np.ndarray = np.zeros(0, bool)  # of the rollouts, if there are enough
+        validation = success
         if len(numbers) >= ENOUGH_HELD_OUT:
             success, validation = self.table.success[numbers], self.table.validation[numbers]
         choices = [
