@@ -12,7 +12,7 @@ from tqdm import tqdm
 from experiments import person
 from lerobot_wmrl.common.files import write_json, write_text
 from lerobot_wmrl.common.policies import read_policy_config
-from lerobot_wmrl.data.dataset import DatasetSource
+from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
 from lerobot_wmrl.play.drive import Drive
 from lerobot_wmrl.play.drivers import PlannerDriver
@@ -72,7 +72,7 @@ def write_script(given: argparse.Namespace) -> None:
         done_frames=given.done_frames, device="cpu",
     )  # fmt: skip
     policy = read_policy_config(given.policy, ["--device=cpu"])
-    world = load_world(env, DatasetSource(given.root), policy, None)
+    world = load_world(env, ChosenEpisodes(given.root), policy, None)
     assert world.table is not None
     order = np.random.default_rng(given.seed).permutation(len(world.table.start)).tolist()
     driven: dict[int, list[list[float]]] = {}

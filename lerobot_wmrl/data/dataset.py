@@ -1,12 +1,17 @@
 """Where LeRobotDatasets are: named on a command line, opened, downloaded, and known by what they hold."""
 
 import hashlib
+from collections.abc import Collection
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+import pyarrow.compute
 import pyarrow.dataset
+from huggingface_hub import snapshot_download
 from huggingface_hub.file_download import repo_folder_name
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import EPISODES_DIR, BackwardCompatibilityError
@@ -68,18 +73,22 @@ class DatasetSource:
         Raises:
             FieldError: there is none, it is not whole, or it cannot be downloaded.
         """
+        return self._open(None)
+
+    def _open(self, episodes: Collection[int] | None) -> LeRobotDataset:
+        """Open the dataset, with the videos of these episodes at least, of all if None."""
         if not self.given:
             raise FieldError(
                 "dataset.root", self.root, "no dataset is named", "give `dataset.root` or `dataset.repo_id`"
             )
-        if not self.repo_id or (self.root and is_whole(Path(self.root))):
-            return open_dataset(self.root, self.repo_id)
+        if not self.repo_id or (self.root and is_whole(Path(self.root), episodes)):
+            return open_dataset(self.root, self.repo_id, episodes)
         try:
-            return download_dataset(self.repo_id, self.revision, self.root or None)
+            return download_dataset(self.repo_id, self.revision, self.root or None, episodes)
         except FieldError:
             if not self.root or not (Path(self.root) / "meta" / "info.json").is_file():
                 raise
-        return open_dataset(self.root, self.repo_id)  # which says what is missing there
+        return open_dataset(self.root, self.repo_id, episodes)  # which says what is missing there
 
 
 @dataclass
@@ -88,10 +97,14 @@ class ChosenEpisodes(DatasetSource):
 
     Args:
         episodes: indices of the episodes to use, as in lerobot-train; by default all. Every twentieth episode
-            of the whole dataset is held out from training, chosen or not.
+            of the whole dataset is held out from training, chosen or not. Of a dataset on the hub, only the
+            videos of these episodes are downloaded.
     """
 
     episodes: list[int] | None = None
+
+    def open(self) -> LeRobotDataset:
+        return self._open(self.episodes)
 
     def flags(self) -> dict[str, Any]:
         return super().flags() | ({} if self.episodes is None else {"dataset.episodes": self.episodes})
@@ -114,17 +127,24 @@ class TrainingData(ChosenEpisodes):
             return [read_episodes(open_dataset(root)) for root in self.more]
 
 
-def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset:
-    """Open a local LeRobotDataset. FieldError if there is none at `root`, or it is not whole."""
+def open_dataset(
+    root: str | Path, repo_id: str | None = None, episodes: Collection[int] | None = None
+) -> LeRobotDataset:
+    """Open a local LeRobotDataset. FieldError if there is none at `root`, or it is not whole.
+
+    Args:
+        episodes: those whose videos must be there; by default all.
+    """
     if not (Path(root) / "meta" / "info.json").is_file():
         raise FieldError(
             "dataset.root", root, "no LeRobotDataset there (meta/info.json is missing)", "record one first"
         )
     name = repo_id or Path(root).absolute().name
     try:
-        missing = missing_files(Path(root))
+        lacking = missing_files(Path(root))
+        missing = lacking and missing_files(Path(root), episodes)
         if not missing:
-            dataset = LeRobotDataset(name, root=root, video_backend=VIDEO_BACKEND)
+            dataset = open_rows(name, episodes if lacking else None, root=root)
     except OLDER_FORMAT as error:
         raise older_format("dataset.root", root, name, root) from error
     except Exception as error:  # parquet, JSON, datasets and the hub each raise their own
@@ -156,10 +176,17 @@ def save_episode(dataset: LeRobotDataset) -> None:
         dataset.save_episode()
 
 
-def download_dataset(repo_id: str, revision: str | None = None, root: str | None = None) -> LeRobotDataset:
-    """Download a dataset of the hub, to `root` or LeRobot's cache, and open it. FieldError if that fails."""
+def download_dataset(
+    repo_id: str, revision: str | None = None, root: str | None = None,
+    episodes: Collection[int] | None = None,
+) -> LeRobotDataset:  # fmt: skip
+    """Download a dataset of the hub, to `root` or LeRobot's cache, and open it. FieldError if that fails.
+
+    Args:
+        episodes: those whose videos are downloaded; by default all.
+    """
     try:
-        dataset = LeRobotDataset(repo_id, root=root, revision=revision, video_backend=VIDEO_BACKEND)
+        dataset = open_rows(repo_id, episodes, root=root, revision=revision)
     except Exception as error:  # the hub's client, parquet and JSON each raise their own
         if isinstance(error, OLDER_FORMAT) and revision is None:
             copy = Path("data") / repo_id.rpartition("/")[2]
@@ -170,6 +197,29 @@ def download_dataset(repo_id: str, revision: str | None = None, root: str | None
             "`dataset.root`",
         ) from error  # fmt: skip
     return with_whole_rate(dataset, "dataset.repo_id", repo_id)
+
+
+def open_rows(repo_id: str, episodes: Collection[int] | None, **where: Any) -> LeRobotDataset:
+    """Open a dataset with all its rows; LeRobot downloads what is missing of it.
+
+    Args:
+        episodes: those whose videos are needed, all if None. One that there is not is for the reader of the
+            rows to refuse.
+        where: LeRobot's `root` and `revision`.
+    """
+    open_videos_of = partial(LeRobotDataset, repo_id, video_backend=VIDEO_BACKEND, **where)
+    if episodes is None:
+        return open_videos_of()
+    total = LeRobotDatasetMetadata(repo_id, **where).total_episodes
+    dataset = open_videos_of(episodes=[each for each in episodes if 0 <= each < total] or None)
+    if missing_files(dataset.root, episodes):
+        snapshot_download(
+            repo_id, repo_type="dataset", revision=dataset.revision, allow_patterns="data/*",
+            **({"local_dir": dataset.root} if where.get("root") else {"cache_dir": HF_LEROBOT_HUB_CACHE}),
+        )  # fmt: skip
+    dataset.episodes = dataset.reader.episodes = None
+    dataset.reader.load_and_activate()
+    return dataset
 
 
 def local_copies(repo_id: str) -> list[Path]:
@@ -205,19 +255,20 @@ def fingerprint(root: Path) -> str:
     return digest.hexdigest()[:12]
 
 
-def is_whole(root: Path) -> bool:
-    """Return whether a dataset's folder has all its files, which a download that was stopped has not."""
+def is_whole(root: Path, episodes: Collection[int] | None = None) -> bool:
+    """Return whether a dataset's folder has all its files, which a download that was stopped has not; of the
+    videos those of `episodes`, all if None."""
     if not (root / "meta" / "info.json").is_file() or not any((root / EPISODES_DIR).glob("*/*.parquet")):
         return False
     try:
-        return not missing_files(root)
+        return not missing_files(root, episodes)
     except (OSError, ValueError):  # a table that is torn, or one of several
         return False
 
 
-def missing_files(root: Path) -> list[Path]:
+def missing_files(root: Path, episodes: Collection[int] | None = None) -> list[Path]:
     """Return files that the table of episodes names and that are not there; LeRobot would ask the hub for
-    them.
+    them. Of the videos, those of `episodes` count, all if None.
 
     The table is read without LeRobot's metadata, which takes as long to open as the whole dataset, and looks
     each path up by itself. Where there is no table, LeRobot says why: the dataset's version is older.
@@ -229,12 +280,15 @@ def missing_files(root: Path) -> list[Path]:
     table = pyarrow.dataset.dataset([str(each) for each in tables], format="parquet")
     if (rows := table.count_rows()) != info.total_episodes:
         raise ValueError(f"{EPISODES_DIR} has {rows} of {info.total_episodes} episodes")
-    files = [("data", info.data_path)]
+    chosen = None
+    if episodes is not None:
+        chosen = pyarrow.compute.field("episode_index").isin(pyarrow.array(episodes, pyarrow.int64()))
+    files = [("data", info.data_path, None)]
     for key, feature in info.features.items():
         if feature["dtype"] == "video":
-            files.append((f"videos/{key}", str(info.video_path)))
-    for kind, pattern in files:
-        places = table.to_table([f"{kind}/chunk_index", f"{kind}/file_index"]).to_pydict().values()
+            files.append((f"videos/{key}", str(info.video_path), chosen))
+    for kind, pattern, wanted in files:
+        places = table.to_table([f"{kind}/chunk_index", f"{kind}/file_index"], wanted).to_pydict().values()
         for chunk, file in set(zip(*places, strict=True)):
             key = kind.removeprefix("videos/")
             named.add(Path(pattern.format(video_key=key, chunk_index=chunk, file_index=file)))

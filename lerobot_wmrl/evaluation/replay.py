@@ -30,18 +30,23 @@ BATCH = 64
 
 @dataclass(frozen=True)
 class Recording:
-    """Recorded episodes: their table, and all their frames, uint8 (rows, N, H, W, 3)."""
+    """Recorded episodes: their table, and their frames.
+
+    Args:
+        table: the episodes.
+        frames: uint8 (rows, N, H, W, 3).
+        chosen: mask of the episodes whose frames may be read; by default all. (E,)
+    """
 
     table: EpisodeTable
     frames: LazyRows
+    chosen: np.ndarray | None = None
 
     @classmethod
-    def read(cls, table: EpisodeTable, model: Any) -> "Recording":
-        """Read the frames of the cameras that a world model looks at, at its size."""
-        tokenizer_config = model.config.tokenizer
-        return cls(
-            table, cached_frames(table.dataset, tokenizer_config.camera_keys, tokenizer_config.image_size)
-        )
+    def read(cls, table: EpisodeTable, model: Any, chosen: np.ndarray | None = None) -> "Recording":
+        """Open the frames of the cameras that a world model looks at, at its size."""
+        cameras, size = model.config.tokenizer.camera_keys, model.config.tokenizer.image_size
+        return cls(table, cached_frames(table.dataset, cameras, size), chosen)
 
     def rows(self, episode: int) -> slice:
         """Return the rows of an episode."""

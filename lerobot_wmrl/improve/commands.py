@@ -14,7 +14,6 @@ from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.lerobot_commands import edit_command, env_flags, merge_command, train_command
 from lerobot_wmrl.common.presets import Flags, format_flags, format_lerobot_flags
 from lerobot_wmrl.common.stages import Stage, never
-from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET
 from lerobot_wmrl.improve.learnt import MAX_STARTS
@@ -250,7 +249,7 @@ def drive(progress: Progress) -> list[str]:
         env = replace(env, task=env.task_names[0])
     real = {} if env is None else env_flags(env, "real_env")
     return ["lerobot-wmrl-play", *format_flags({
-        "world_model.path": str(plan.out / "world_model"), **DatasetSource.flags(plan.data),
+        "world_model.path": str(plan.out / "world_model"), **plan.data.flags(),
         "policy.path": progress.policies[progress.chosen()], **real, **progress.criterion(),
     })]  # fmt: skip
 

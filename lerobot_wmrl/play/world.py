@@ -16,7 +16,7 @@ from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.common.policy_checks import fit_to_environment
 from lerobot_wmrl.common.success_criterion import SuccessCriterion
-from lerobot_wmrl.data.dataset import DatasetSource
+from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -242,14 +242,14 @@ class World:
 
 
 def load_world(
-    config: WorldModelEnv, dataset: DatasetSource, policy: PreTrainedConfig | None,
+    config: WorldModelEnv, dataset: ChosenEpisodes, policy: PreTrainedConfig | None,
     real_env: EnvConfig | None, end_at_success: bool = True,
 ) -> World:  # fmt: skip
     """Load what `config` names, and check that dataset and policy fit the world model.
 
     Args:
         config: configuration of the imagined episodes.
-        dataset: dataset in whose frames they can begin, if it is given.
+        dataset: episodes in whose frames they can begin, if it is given.
         policy: that can act.
         real_env: that takes the same actions.
         end_at_success: whether an episode ends when it succeeds.
@@ -268,8 +268,9 @@ def load_world(
         real_env = replace(real_env, cameras=list(world.tokenizer_config.cameras), image_size=side)
     world.real_env = real_env
     if dataset.given:
-        world.table = read_episodes(dataset.open())
-        check_dataset(world.model, world.table.dataset.meta)
+        recorded = read_episodes(dataset.open())
+        check_dataset(world.model, recorded.dataset.meta)
+        world.table = recorded.subset(recorded.among(dataset.episodes))
     if policy is not None and hasattr(policy, "proposal_path"):
         raise FieldError(
             "policy.path", policy.pretrained_path, f"{policy.type} plans in a world model, as the page does",

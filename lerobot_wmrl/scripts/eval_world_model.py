@@ -133,6 +133,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     from lerobot_wmrl.common.hub import check_login
     from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
     from lerobot_wmrl.evaluation.evidence import LabelledRollouts
+    from lerobot_wmrl.evaluation.replay import Recording
     from lerobot_wmrl.maniskill.recordings import scene_splits
     from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model
 
@@ -150,7 +151,8 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes, chosen)
     with Claim(cfg.output_dir, draccus.encode(cfg)).held():
         warn_of_learnt(cfg.model.path, LabelledRollouts(cfg.dataset.name, table, episodes))
-        measure(cfg, model, text_model, table, episodes, imagination, policies)
+        recording = Recording.read(table, model, chosen)
+        measure(cfg, model, text_model, recording, episodes, imagination, policies)
 
 
 def warn_of_learnt(world_model: str, rollouts: "LabelledRollouts") -> None:
@@ -169,7 +171,7 @@ def measure(
     cfg: EvalWorldModelConfig,
     model: "ActionWorldModelRewardModel",
     text_model: "TextWorldModelRewardModel | None",
-    table: "EpisodeTable",
+    recording: "Recording",
     episodes: "np.ndarray",
     imagination: "WorldModelEnv | None",
     policies: "Mapping[str, PreTrainedConfig]",
@@ -177,10 +179,8 @@ def measure(
     """Replay episodes, evaluate policies in imagination, write metrics.json, metrics.md and pictures."""
     from lerobot_wmrl.common.files import write_json, write_text
     from lerobot_wmrl.evaluation.reconstruction import reconstruction_metrics
-    from lerobot_wmrl.evaluation.replay import Recording
     from lerobot_wmrl.evaluation.report import evaluate, report_action_model, report_agreement
 
-    recording = Recording.read(table, model)
     evaluation = evaluate(model, recording, episodes, cfg.episode_length)
     reports = [report_action_model(model, recording, evaluation, cfg.criterion, cfg.output_dir)]
     if text_model is not None:
@@ -190,7 +190,7 @@ def measure(
         agreement = policy_agreement(cfg, imagination, policies)
         reports.append(report_agreement(agreement, cfg.output_dir))
     metrics = {name: value for report in reports for name, value in report.metrics.items()}
-    metrics["tokenizer"] = reconstruction_metrics(model, table, recording.frames, episodes)
+    metrics["tokenizer"] = reconstruction_metrics(model, recording.table, recording.frames, episodes)
     metrics |= {"dataset": cfg.dataset.name, "split": cfg.split}
     page = "\n\n".join(report.page for report in reports)
     write_json(cfg.output_dir / "metrics.json", metrics)

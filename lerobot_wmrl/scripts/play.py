@@ -41,7 +41,7 @@ from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least
 from lerobot_wmrl.common.files import require_new, writing
 from lerobot_wmrl.common.policies import check_weights, read_policy_config
 from lerobot_wmrl.common.policy_checks import require_trained
-from lerobot_wmrl.data.dataset import DatasetSource
+from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.play.checks import LAST_PORT, whole_number
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
@@ -60,7 +60,8 @@ class PlayConfig(RunConfig):
         world_model: the action world model.
         text_world_model: a text world model, for goal frames and how similar the imagined ones are to them;
             may be left out.
-        dataset: episodes in whose frames a drive can begin.
+        dataset: episodes in whose frames a drive can begin. The page numbers those that `dataset.episodes`
+            chooses from 0 on.
         policy: a policy that can act, `--policy.path=…`.
         real_env: an environment that takes the same actions, and in whose resets a drive can begin. ManiSkill
             shows the world model's cameras.
@@ -82,7 +83,7 @@ class PlayConfig(RunConfig):
 
     world_model: Checkpoint = field(default_factory=Checkpoint)
     text_world_model: Checkpoint = field(default_factory=Checkpoint)
-    dataset: DatasetSource = field(default_factory=DatasetSource)
+    dataset: ChosenEpisodes = field(default_factory=ChosenEpisodes)
     policy: PreTrainedConfig | None = None
     real_env: EnvConfig | None = None
     done_threshold: float = DONE_THRESHOLD

@@ -2,14 +2,17 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from lerobot.datasets import dataset_metadata, lerobot_dataset
+from lerobot.datasets import dataset_metadata, feature_utils, lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wmrl.data import dataset as own_datasets
 from lerobot_wmrl.data import frame_cache
-from lerobot_wmrl.data.dataset import DatasetSource, TrainingData, open_dataset
+from lerobot_wmrl.data.dataset import ChosenEpisodes, DatasetSource, TrainingData, open_dataset
+from lerobot_wmrl.data.decoding import decode, rows_of
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from tests.hub_server import Hub
@@ -19,17 +22,33 @@ NAME = "somebody/episodes"
 
 
 @pytest.fixture
-def published(
-    hub: Hub, small_dataset: LeRobotDataset, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> LeRobotDataset:
-    """The small dataset on the hub, and an empty cache of LeRobot's."""
-    for module in (dataset_metadata, lerobot_dataset, frame_cache):
+def empty_cache(hub: Hub, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """An empty cache of LeRobot's, and a hub."""
+    for module in (dataset_metadata, lerobot_dataset, frame_cache, own_datasets):
         for name in ("HF_LEROBOT_HOME", "HF_LEROBOT_HUB_CACHE"):
             if hasattr(module, name):
                 monkeypatch.setattr(module, name, tmp_path / "home" / ("hub" if "HUB" in name else ""))
-    own = LeRobotDataset(NAME, root=small_dataset.root)
-    own.push_to_hub()
+
+
+@pytest.fixture
+def published(empty_cache: None, small_dataset: LeRobotDataset) -> LeRobotDataset:
+    """The small dataset on the hub."""
+    LeRobotDataset(NAME, root=small_dataset.root).push_to_hub()
     return small_dataset
+
+
+@pytest.fixture
+def in_many_files(
+    empty_cache: None, make_synthetic_dataset: Callable[..., LeRobotDataset],
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> LeRobotDataset:  # fmt: skip
+    """Four episodes on the hub, each in a video and a table of its own, as those of a large dataset are."""
+    monkeypatch.setattr(feature_utils, "DEFAULT_VIDEO_FILE_SIZE_IN_MB", 1e-6)
+    monkeypatch.setattr(feature_utils, "DEFAULT_DATA_FILE_SIZE_IN_MB", 1e-6)
+    root = make_synthetic_dataset(tmp_path / "own", 4).root
+    (own := LeRobotDataset(NAME, root=root)).push_to_hub()
+    assert [len(list(Path(root).glob(f"{folder}/**/file-*"))) for folder in ("data", "videos")] == [4, 4]
+    return own
 
 
 def test_it_is_downloaded_once(published: LeRobotDataset, hub: Hub) -> None:
@@ -61,6 +80,33 @@ def test_a_folder_that_lacks_files_and_is_on_no_hub_says_what_it_lacks(
     next((tmp_path / "torn" / "data").rglob("*.parquet")).unlink()
     with pytest.raises(ValueError, match=r"1 files are missing, the first is data/"):
         DatasetSource(str(tmp_path / "torn"), "somebody/nothing").open()
+
+
+@pytest.mark.parametrize("folder", ["", "mine"])
+def test_of_chosen_episodes_alone_videos_are_downloaded(
+    folder: str, in_many_files: LeRobotDataset, hub: Hub, tmp_path: Path
+) -> None:
+    root = str(tmp_path / folder) if folder else ""
+    source = ChosenEpisodes(root, NAME, episodes=[1, 3, 3, 9])
+    dataset = source.open()
+    videos = sorted(path.name for path in Path(dataset.root).glob("videos/**/*.mp4"))
+    assert videos == ["file-001.mp4", "file-003.mp4"]
+    key, own = "observation.images.third_view", read_episodes(in_many_files)
+    table = read_episodes(dataset)
+    assert (table.action == own.action).all(), "which episodes are held out is decided among all of them"
+    for episode in (1, 3):
+        rows = rows_of(dataset, episode)
+        frames = decode(dataset, episode, key, rows)
+        assert (frames == decode(in_many_files, episode, key, rows)).all()
+    with pytest.raises(ValueError, match=r"dataset\.episodes=\[1, 3, 3, 9\]: there is no episode 9"):
+        table.among(source.episodes)
+    hub.requests.clear()
+    assert len(open_dataset(dataset.root, episodes=[3])) == len(in_many_files)
+    source.open()
+    assert not [path for _, path in hub.requests if "resolve" in path], "they are there"
+    with pytest.raises(ValueError, match=r"2 files are missing, the first is videos/.*file-000\.mp4"):
+        open_dataset(dataset.root)
+    assert len(list(Path(DatasetSource(root, NAME).open().root).glob("videos/**/*.mp4"))) == 4
 
 
 def test_a_tokenizer_trains_on_it(published: LeRobotDataset, tmp_path: Path) -> None:

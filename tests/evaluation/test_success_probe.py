@@ -1,9 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
+from lerobot_wmrl.data.lazy_rows import LazyRows
 from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.evaluation.success_probe import labelled_frames, train_probe
 
@@ -39,6 +42,17 @@ def test_labels_belong_to_the_frame_an_action_led_to(small_dataset):
         pixels = torch.nn.functional.interpolate(image, (32, 32), mode="area")
         frame = (pixels * 255).round().byte().permute(0, 2, 3, 1).numpy()
         assert bool(success) in labels[frame.tobytes()]
+
+
+def test_the_probe_learns_from_chosen_episodes_alone(small_dataset, monkeypatch):
+    """Of others, the videos may not be there."""
+    source = recording_of(small_dataset)
+    read: set[int] = set()
+    monkeypatch.setattr(LazyRows, "fill", lambda self, rows: read.update(np.asarray(rows).tolist()))
+    chosen = np.arange(6) < 3
+    assert train_probe(Lossless(), replace(source, chosen=chosen)) is not None
+    assert read
+    assert read <= set(source.table.row_numbers(np.flatnonzero(chosen)).tolist())
 
 
 def test_the_probe_tells_success_in_episodes_it_has_not_seen(make_synthetic_dataset, tmp_path):

@@ -14,7 +14,7 @@ from selenium import webdriver
 from selenium.webdriver.remote.webdriver import WebDriver
 
 from lerobot_wmrl.common.policies import read_policy_config
-from lerobot_wmrl.data.dataset import DatasetSource
+from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
 from lerobot_wmrl.play.saving import SavedEpisodes
@@ -45,7 +45,7 @@ def make_world(small_dataset, trained_models, play_policy) -> Callable[..., Worl
             **{"episode_length": 300, "device": "cpu", **settings},
         )
         simulator = WmrlManiSkillEnv(task="push") if real else None
-        return load_world(env, DatasetSource(str(small_dataset.root)), play_policy, simulator, end)
+        return load_world(env, ChosenEpisodes(str(small_dataset.root)), play_policy, simulator, end)
 
     return make
 

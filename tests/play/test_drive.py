@@ -13,7 +13,7 @@ from lerobot.envs.configs import PushtEnv
 
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.dataset import DatasetSource
+from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.play.drive import Drive, RealEpisode
@@ -46,14 +46,14 @@ def test_a_real_environment_has_one_task(world):
     with pytest.raises(
         FieldError, match=r"^real_env\.task=push,pull: a drive needs a single task; choose one"
     ):
-        load_world(world.config, DatasetSource(), None, several)
+        load_world(world.config, ChosenEpisodes(), None, several)
 
 
 def test_a_policy_that_plans_is_refused(world):
     with pytest.raises(
         FieldError, match=r"^policy\.path=None: wm_mpc plans in a world model, as the page does"
     ):
-        load_world(world.config, DatasetSource(), WmMpcConfig(device="cpu"), None)
+        load_world(world.config, ChosenEpisodes(), WmMpcConfig(device="cpu"), None)
 
 
 def test_a_real_environment_gets_actions_beyond_its_space_and_another_state_is_refused(world, monkeypatch):
@@ -190,6 +190,20 @@ def test_a_plan_is_made_anew_after_somebody_else_has_acted(world, saved):
     visit.answer({"do": "step", "driver": "you", "action": [0.04] * 7})
     visit.answer({"do": "step", "driver": "planner"})
     assert len(visit.drivers["planner"].plan) == planned
+
+
+def test_of_chosen_episodes_the_page_offers_no_others(world, small_dataset):
+    chosen = ChosenEpisodes(str(small_dataset.root), episodes=[4, 2])
+    some = load_world(world.config, chosen, None, None)
+    assert [each["success"] for each in some.description()["episodes"]] == [False, True]
+    for index, episode in enumerate((2, 4)):
+        drive = some.begin({"episode": index, "frame": 2}, None)
+        whole = world.begin({"episode": episode, "frame": 2}, None)
+        assert (drive.recorded.images[:1] == whole.recorded.images[:1]).all()
+    with pytest.raises(FieldError, match=r"episode=2: .*"):
+        some.begin({"episode": 2, "frame": 0}, None)
+    with pytest.raises(FieldError, match=r"dataset\.episodes=\[7\]: there is no episode 7"):
+        load_world(world.config, ChosenEpisodes(str(small_dataset.root), episodes=[7]), None, None)
 
 
 def test_the_recorded_episode_ends(world, saved):

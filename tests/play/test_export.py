@@ -22,7 +22,7 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.wait import WebDriverWait
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
+from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -174,7 +174,7 @@ def test_a_page_reads_the_instruction_that_it_is_given(make_synthetic_dataset, t
     config = WorldModelEnv(
         world_model_path=str(told_apart(Path(root), tmp_path)), reward=GeneralConfig(alpha=1), device="cpu"
     )
-    world = load_world(config, DatasetSource(root=str(root)), None, None)
+    world = load_world(config, ChosenEpisodes(root=str(root)), None, None)
     folder = tmp_path / "page"
     export_page(world, folder, STARTS)
     pictures, state, actions = first_frame(folder, 0)
