@@ -31,12 +31,11 @@ from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_policy_cnn.processor_cnn import make_cnn_pre_post_processors
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.pipeline import make_pipeline
+from lerobot_wmrl.common.pipeline import make_pipeline, unchanged
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
-from lerobot_wmrl.scripts.train import compacted
 from lerobot_wmrl.world_models.checkpoint import read_config
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "ppo_speed.json"
@@ -88,7 +87,8 @@ def untrained_policy(env: gym.vector.VectorEnv, device: str) -> tuple[CnnPolicy,
         for name, shape in {ACTION: (size,), OBS_STATE: state}.items()
     }
     processors = make_cnn_pre_post_processors(config, stats)
-    return CnnPolicy(config).to(device).eval(), make_pipeline(config, *processors, shown=compacted(env))
+    shown = env.store_compact() if hasattr(env, "store_compact") else unchanged
+    return CnnPolicy(config).to(device).eval(), make_pipeline(config, *processors, shown=shown)
 
 
 def buffer_bytes(buffer: RolloutBuffer) -> int:
@@ -102,7 +102,7 @@ def measure(env: Any, steps: int, iterations: int, device: str, train_encoder: b
     policy, pipeline = untrained_policy(env, device)
     config = PPOConfig(value_iterations=0, target_kl=1e9, max_reference_kl=1e9, train_encoder=train_encoder)
     algorithm = PPO(policy, config)
-    pipeline = algorithm.encoding(pipeline)
+    pipeline = algorithm.with_frozen_encoder(pipeline)
     buffer, watch = RolloutBuffer(steps, env.num_envs, device), Stopwatch(torch.device(device))
     if hasattr(env, "model"):
         for part, methods in WORLD.items():
@@ -111,12 +111,12 @@ def measure(env: Any, steps: int, iterations: int, device: str, train_encoder: b
     else:
         watch.watch(env, "simulator", "step", "reset")
     watch.watch(policy, "policy", "sample", "value", "encode")
-    watch.watch(algorithm, "update", "prepare", "update")
+    watch.watch(algorithm, "update", "make_minibatches", "update")
     found: list[dict[str, float]] = []
     for iteration in range(1 + iterations):
         watch.seconds, began = {}, watch.now()
         collect(env, policy, pipeline, buffer, iteration * env.num_envs)
-        minibatches, _ = algorithm.prepare(buffer, pipeline)
+        minibatches, _ = algorithm.make_minibatches(buffer, pipeline)
         algorithm.update(iter(minibatches))
         whole = watch.now() - began
         found.append({**watch.seconds, "rest": whole - sum(watch.seconds.values()), "iteration": whole})
@@ -154,7 +154,7 @@ def main() -> None:
     imagination = world_model_env(given, episode_length=given.steps, device=given.device)
     worlds: dict[str, tuple[Any, int]] = {"world_model": (imagination, given.num_envs)}
     if given.simulators:
-        model: Any = read_config(given.world_model, "action_world_model")
+        model = read_config(given.world_model, "action_world_model")
         simulator = WmrlManiSkillEnv(
             cameras=list(model.tokenizer.cameras),
             image_size=model.tokenizer.image_size,

@@ -131,8 +131,7 @@ def make_model(given: argparse.Namespace, flags: Sequence[str]) -> ActionWorldMo
     """The checkpoint, or random weights of a preset's sizes, changed by `flags`."""
     device = given.device or ("cuda" if torch.cuda.is_available() else "cpu")
     if given.world_model:
-        model: ActionWorldModelRewardModel = load_model(given.world_model, "action_world_model", device)
-        return model
+        return load_model(given.world_model, "action_world_model", device)
     tokenizer, config = (
         preset_config(given.sizes, kind, flags if kind == "action_world_model" else ()).model
         for kind in ("frame_tokenizer", "action_world_model")

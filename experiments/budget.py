@@ -14,6 +14,10 @@ from typing import Final, NamedTuple
 import yaml
 
 from experiments.study import Step, Study
+from lerobot_wmrl.common.errors import FieldError, renamed
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.data.ledger import Ledger, Limits
 
 COMMANDS: Final = ("lerobot-wmrl-record", "lerobot-wmrl-train", "lerobot-wmrl-train-world-model")
 """Commands that are given the ledger."""
@@ -66,9 +70,6 @@ def begin(study: Study) -> None:
     """
     if study.limits is None:
         return
-    from lerobot_wmrl.common.errors import FieldError
-    from lerobot_wmrl.data.ledger import Ledger, Limits
-
     check_commands(study)
     try:
         Ledger.create(study.budget, Limits(**study.limits))
@@ -116,11 +117,6 @@ def check_datasets(study: Study, step: Step, checked: frozenset[Source] = frozen
     """
     if study.limits is None:
         return checked
-    from lerobot_wmrl.common.errors import FieldError, renamed
-    from lerobot_wmrl.data.dataset import open_dataset
-    from lerobot_wmrl.data.episodes import read_episodes
-    from lerobot_wmrl.data.ledger import Ledger
-
     found = {each for each in sources(step) if each.recorded} - checked
     for source in sorted(found, key=lambda each: each[:2]):
         try:

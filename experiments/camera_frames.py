@@ -8,6 +8,7 @@ import numpy as np
 from tqdm import tqdm
 
 from lerobot_dataset_maniskill.planners import TASK_KINDS, follow_plan
+from lerobot_wmrl.common.seeds import GATE_SEED
 from lerobot_wmrl.maniskill.backend import simulating_context
 from lerobot_wmrl.maniskill.cameras import VIEWS, Rendering, View
 from lerobot_wmrl.maniskill.scenes import scenes_of
@@ -22,7 +23,8 @@ CANDIDATES = {
     "side_mid": View((0.0, 0.55, 0.42), (0.0, -0.035, 0.04), 0.6),
     "side_low": View((-0.02, 0.62, 0.28), (0.0, -0.03, 0.05), 0.6),
 }
-FIRST_SEED = 3_000_000
+FIRST_SEED = GATE_SEED
+"""Neither recorded nor evaluated on."""
 EVERY = 5
 """Steps between two frames."""
 

@@ -24,9 +24,10 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Normal
 
-from lerobot_wmrl.common.constants import EVALUATION_SEED, Observation
+from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.pipeline import Pipeline
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.envs.tensor_env import Outcome, TensorEnv
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig

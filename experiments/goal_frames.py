@@ -70,7 +70,7 @@ def measure(
     folder: Path, recording: Recording, episodes: np.ndarray, probe: TrainedProbe | None
 ) -> dict[str, Any]:
     """Measure the goal frames of one trained model, and the seconds that one takes."""
-    model: TextWorldModelRewardModel = load_model(folder, MODEL)
+    model = load_model(folder, MODEL)
     success = recording.table.success[episodes]
     began = time.perf_counter()
     goals = imagine_goals(model, recording, episodes)

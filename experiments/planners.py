@@ -19,13 +19,14 @@ from tqdm import tqdm
 
 from lerobot_dataset_maniskill.planners import MOTIONS, TASK_KINDS, Motion, follow_plan
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.seeds import SELECTION_SEED
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.maniskill.cameras import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
 
-FIRST_SEED = 2_000_000
+FIRST_SEED = SELECTION_SEED
 """Neither recorded nor evaluated on."""
 
 Way = np.ndarray

@@ -53,17 +53,17 @@ def loader(docs: Path) -> Load:
     return load
 
 
-def results_page(docs: Path = DOCS) -> str:
+def results_page() -> str:
     """Return docs/results.md."""
 
-    load = loader(docs)
+    load = loader(DOCS)
     parts, contents, missing = [], [], []
     for chapter, sections in CHAPTERS.items():
         shown: list[str] = []
         for name, section in sections.items():
             cells = read_cells(STUDIES / f"{name}.yaml")
             results = [each for cell in cells for each in cell.results if each.endswith(".json")]
-            published = [result for result in results if (docs / result).exists()]
+            published = [result for result in results if (DOCS / result).exists()]
             if results and not published:
                 missing.append(f"- {link(name)}: {' '.join(cells[0].question.split())}")
                 continue

@@ -16,11 +16,12 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_dataset_maniskill.planners import MOTIONS
 from lerobot_wmrl.common.checkpoints import PARTS, checkpoint_digest, resolved_name
 from lerobot_wmrl.common.command_line import RunConfig
-from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS, POLICY
+from lerobot_wmrl.common.constants import KINDS, POLICY
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
 from lerobot_wmrl.common.hub import check_login
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.policy_checks import require_trained
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
@@ -351,14 +352,14 @@ def imagined_content(env: WorldModelEnv) -> dict[str, Any]:
     from lerobot_wmrl.envs.content import content_of
     from lerobot_wmrl.world_models.checkpoint import read_config
 
-    model: Any = read_config(env.world_model_path, "action_world_model")
+    model = read_config(env.world_model_path, "action_world_model")
     reward = draccus.encode(env.reward, RewardModelConfig)
     general = {each.name for each in fields(RewardModelConfig)} - {"pretrained_path"}  # device, hub
     return {
         "world_model": env.world_model_path,
         "starts": draccus.encode(env.dataset),
-        "cameras": list(model.tokenizer.cameras),
-        "image_size": model.tokenizer.square_side,
+        "cameras": list(model.trained_tokenizer.cameras),
+        "image_size": model.trained_tokenizer.square_side,
         "done_threshold": env.done_threshold,
         "done_frames": env.done_frames,
         "reward": env.reward.type,

@@ -17,12 +17,6 @@ from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.maniskill.embodiment import FPS
 
-DIGESTS: Final = ("policy_content", "content")
-"""Settings that say what other settings name, which earlier versions did not keep."""
-
-BY_DEFAULT: Final = {"video": True, "like_columns": True}
-"""Settings that earlier versions left out where they were so."""
-
 WHOLE: Final = [0, 1]
 """Value of `shard` for a recording that is not split."""
 
@@ -76,18 +70,11 @@ def already_recorded(
         return False
     if settings is None:
         raise FieldError("output_dir", output_dir, "holds something else", "choose a new folder")
-    require_same_recording(settings, content, output_dir)
+    require_same(output_dir, settings, content)
     if problem := find_damage(output_dir, episodes):
         raise FieldError("output_dir", output_dir, problem, "remove the folder and record again")
     print(f"{output_dir} is already recorded: {episodes} episodes")
     return True
-
-
-def require_same_recording(stored: Mapping[str, Any], content: Mapping[str, Any], folder: Path) -> None:
-    """Raise FieldError unless both settings describe the same episodes."""
-    left_out = {name: value for name, value in BY_DEFAULT.items() if name in content}
-    left_out |= {name: content[name] for name in DIGESTS if name in content}  # earlier versions wrote none
-    require_same(folder, {**left_out, **stored}, content)
 
 
 def merge_shards(shards: Sequence[Path], output_dir: Path, repo_id: str) -> None:
@@ -137,7 +124,7 @@ def check_set(shards: Sequence[Path], contents: Sequence[Mapping[str, Any]]) -> 
     """Raise FieldError for a shard of another recording, one that occurs twice, or one that is missing."""
     if not shards:
         raise FieldError("merge_shards", "[]", "give the folders of all shards")
-    first, *_ = contents = [{**BY_DEFAULT, **content} for content in contents]
+    first, *_ = contents
     for shard, content in zip(shards, contents, strict=True):
         differing = different_settings(first, content, ("shard",))
         if differing or content["shard"][1] != first["shard"][1]:

@@ -21,11 +21,19 @@ from pathlib import Path
 from typing import Final
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_dataset_maniskill.merging import merge_shards
+from lerobot_dataset_maniskill.publishing import ONLY_PUBLISHES, publish
+from lerobot_dataset_maniskill.recorder import record
+from lerobot_dataset_maniskill.worker import silence_libraries
 from lerobot_wmrl.common.command_line import chosen_types, run_command
 from lerobot_wmrl.common.errors import renamed, suggestion
 from lerobot_wmrl.common.files import writing
+from lerobot_wmrl.common.hub import create_repo, publishing
 from lerobot_wmrl.common.presets import format_flags, read_settings, without_other_types
 from lerobot_wmrl.common.settings import settings_of
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.data.ledger import Ledger
 from lerobot_wmrl.maniskill.scenes import describe_scenes
 
 MANISKILL: Final = RecordConfig().env.type
@@ -91,13 +99,6 @@ def run(config: RecordConfig) -> None:
         return
     from huggingface_hub import HfApi
 
-    from lerobot_dataset_maniskill.merging import merge_shards
-    from lerobot_dataset_maniskill.publishing import ONLY_PUBLISHES, publish
-    from lerobot_dataset_maniskill.recorder import record
-    from lerobot_dataset_maniskill.worker import silence_libraries
-    from lerobot_wmrl.common.hub import create_repo, publishing
-    from lerobot_wmrl.data.dataset import open_dataset
-
     silence_libraries()
     if config.merge_shards:
         config.validate()
@@ -116,10 +117,6 @@ def run(config: RecordConfig) -> None:
 
 def check_shards(config: RecordConfig) -> None:
     """Raise FieldError unless the shards are in the ledger, if one is given: then it knows the whole too."""
-    from lerobot_wmrl.data.dataset import open_dataset
-    from lerobot_wmrl.data.episodes import read_episodes
-    from lerobot_wmrl.data.ledger import Ledger
-
     if config.budget is not None:
         with renamed("dataset.root", "merge_shards"):
             for shard in config.merge_shards:

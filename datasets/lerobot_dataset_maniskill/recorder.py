@@ -12,13 +12,13 @@ from typing import Any, Final, Protocol
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.elsewhere import Rollouts
 from lerobot_dataset_maniskill.maniskill import ManiSkillEpisodes
-from lerobot_dataset_maniskill.merging import already_recorded, merge_folders, require_same_recording
+from lerobot_dataset_maniskill.merging import already_recorded, merge_folders
 from lerobot_dataset_maniskill.writer import find_damage
-from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.files import foreign_files, write_json, writing
-from lerobot_wmrl.common.output_folders import hold_lock
+from lerobot_wmrl.common.output_folders import hold_lock, require_same
 from lerobot_wmrl.common.policies import check_weights
+from lerobot_wmrl.common.seeds import EVALUATION_SEED, GATE_SEED
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.ledger import IMAGINED, ROLLOUTS, Ledger
@@ -130,7 +130,7 @@ def claimed(root: Path, work: Path, content: Mapping[str, Any]) -> Iterator[None
     with hold_lock(root, work / LOCK):
         stored = work / RECORDING_FILE
         if stored.is_file() and has_parts(work):
-            require_same_recording(json.loads(stored.read_text()), content, root)
+            require_same(root, json.loads(stored.read_text()), content)
         else:
             if not stored.is_file() and foreign_files(work, LOCK, RECORDING_FILE):
                 raise FieldError(

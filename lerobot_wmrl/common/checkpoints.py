@@ -71,8 +71,8 @@ def model_folder(path: str | Path) -> Path:
 
 
 def settled_folder(path: str) -> Path:
-    """Return `model_folder` with the checkpoint behind the link `last` in place of it: the link moves on.
-    It is as relative or absolute as the path."""
+    """Return `model_folder` with its links resolved, since a longer training moves `last` on; relative to the
+    working directory if `path` is."""
     folder = model_folder(path)
     if not folder.is_dir():
         return folder

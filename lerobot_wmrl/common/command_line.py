@@ -164,7 +164,7 @@ def with_equals_signs(argv: Sequence[str]) -> list[str]:
 
 
 def with_default_types(argv: Sequence[str], config_class: type) -> list[str]:
-    """Say the default type of what settings were typed of, which draccus asks for: `--env.type=…`.
+    """Add `--env.type=<default>`, which draccus asks for, where settings of `env` are typed without its type.
 
     Not beside a configuration in a folder or on the hub, which says the types itself.
     """
@@ -180,11 +180,18 @@ def with_texts_as_typed(argv: Sequence[str], config_class: type) -> list[str]:
     marks: draccus reads every value as YAML, and makes another text of the number."""
     kinds = {each.name: each.kind for each in settings_of(config_class, chosen_types(argv))}
     parts = (argument.partition("=") for argument in argv)
-    return [f"{name}{equals}{as_typed(value, kinds.get(name[2:], ''))}" for name, equals, value in parts]
+    return [
+        f"{name}{equals}{quoted_for_yaml(value, kinds.get(name[2:], ''))}" for name, equals, value in parts
+    ]
 
 
-def as_typed(value: str, kind: str) -> str:
-    """Return what a setting of a kind is written as in YAML, so that its texts stay as they are."""
+def quoted_for_yaml(value: str, kind: str) -> str:
+    """Quote the value of a setting if YAML would read another string from it.
+
+    Args:
+        value: as it was typed.
+        kind: the setting's type, such as `str`, `Path` or `list[str]`; others are returned as they are.
+    """
     try:
         read = yaml.safe_load(value)
     except yaml.YAMLError:

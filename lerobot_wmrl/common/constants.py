@@ -30,12 +30,3 @@ DONE_FRAMES: Final = 3
 
 DYNA: Final = "dyna"
 """Folder of a training's output in which the world models of its Dyna rounds are."""
-
-EVALUATION_SEED: Final = 1_000_000
-"""Recording and training seeds are below this number, evaluation seeds from it to the next."""
-
-SELECTION_SEED: Final = 2_000_000
-"""First of the seeds on which the checkpoints of a training are compared."""
-
-GATE_SEED: Final = 3_000_000
-"""First of the seeds of the rollouts that a world model is asked about while a policy trains in it."""

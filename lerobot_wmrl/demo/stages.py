@@ -7,11 +7,11 @@ from typing import Any, Final
 
 from lerobot_wmrl.common.checkpoints import last_model
 from lerobot_wmrl.common.command_line import RunConfig
-from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
 from lerobot_wmrl.common.lerobot_commands import env_flags, train_command
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags, presets_of
+from lerobot_wmrl.common.seeds import EVALUATION_SEED, require_seed
 from lerobot_wmrl.common.stages import Stage
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.dataset import ChosenEpisodes
@@ -26,8 +26,8 @@ from lerobot_wmrl.improve.report.page import Page, stage_records
 from lerobot_wmrl.improve.report.words import verdict
 from lerobot_wmrl.improve.results import read_place
 
-SEED_STRIDE: Final = 100_000
-"""Demo seed s records and trains with seeds from s·SEED_STRIDE on, below EVALUATION_SEED."""
+SEEDS_A_DEMO: Final = 100_000
+"""Demo seed s records and trains with seeds from s·SEEDS_A_DEMO on, below EVALUATION_SEED."""
 
 EXPLORATION: Final = 0.4
 """Largest noise on the cloned policy's actions in its rollouts, as a share of the action box."""
@@ -75,13 +75,9 @@ class DemoConfig(RunConfig):
     def validate(self) -> None:
         """Raise FieldError for a setting that cannot be."""
         require_choice(self, "size", [*presets_of("demo")])
-        last = EVALUATION_SEED // SEED_STRIDE - 1
-        if not 0 <= self.seed <= last:
-            raise FieldError(
-                "seed", self.seed, f"must be from 0 to {last}, so that no evaluation seed is trained on"
-            )
+        require_seed(self, EVALUATION_SEED // SEEDS_A_DEMO - 1)
         require_at_least(self, 1, "demonstrations", "eval_episodes")
-        fewest, most = VALIDATION_EVERY - self.demonstrations, SEED_STRIDE - ROLLOUT_SEED_OFFSET
+        fewest, most = VALIDATION_EVERY - self.demonstrations, SEEDS_A_DEMO - ROLLOUT_SEED_OFFSET
         if not max(1, fewest) <= self.rollouts <= most:
             raise FieldError(
                 "rollouts", self.rollouts, f"must be from {max(1, fewest)}, so that an episode is held out, "
@@ -138,7 +134,7 @@ class Demo:
 
     @property
     def first_seed(self) -> int:
-        return self.config.seed * SEED_STRIDE
+        return self.config.seed * SEEDS_A_DEMO
 
     def improvement(self) -> Progress:
         """Return what the stage `improve` does, once there is a policy to improve."""

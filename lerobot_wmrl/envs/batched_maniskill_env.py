@@ -10,7 +10,8 @@ from gymnasium.vector import AutoresetMode
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import EVALUATION_SEED, Observation
+from lerobot_wmrl.common.constants import Observation
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.maniskill_env import image_observations, observation_space
 from lerobot_wmrl.envs.scene_results import SceneResults

@@ -132,7 +132,7 @@ class WorldModelEnv(EnvConfig):
             )  # fmt: skip
         from lerobot_wmrl.world_models.checkpoint import read_config
 
-        model: Any = read_config(self.world_model_path, "action_world_model")
+        model = read_config(self.world_model_path, "action_world_model")
         if self.fps not in (0, model.embodiment.fps):
             raise FieldError(
                 "fps", self.fps, f"the world model has learnt {model.embodiment.fps} frames a second",
@@ -144,8 +144,8 @@ class WorldModelEnv(EnvConfig):
         self.features[ACTION] = PolicyFeature(type=FeatureType.ACTION, shape=(model.action_size,))
         if model.state_size:
             self.features["agent_pos"] = PolicyFeature(type=FeatureType.STATE, shape=(model.state_size,))
-        shapes = model.tokenizer.frame_shapes.values()
-        for camera, (colors, height, width) in zip(model.tokenizer.cameras, shapes, strict=True):
+        shapes = model.trained_tokenizer.frame_shapes.values()
+        for camera, (colors, height, width) in zip(model.trained_tokenizer.cameras, shapes, strict=True):
             pixels = "pixels" if camera == OBS_IMAGE else f"pixels/{camera}"  # as LeRobot's environments do
             self.features[pixels] = PolicyFeature(FeatureType.VISUAL, (height, width, colors))
             self.features_map[pixels] = camera_key(camera)

@@ -15,10 +15,11 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION, FreezeAfterEpisodeEnd, prepro
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import EVALUATION_SEED, Observation
+from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.common.policy_checks import check_fit, learnt_range, seen_shape
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_hub import HubEnv
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.tensor_env import Outcome, TensorEnv

@@ -13,8 +13,9 @@ from lerobot.envs.utils import FreezeAfterEpisodeEnd
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import EVALUATION_SEED, Observation
+from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.images import from_bytes
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.scene_results import CountingAsyncVectorEnv, CountingSyncVectorEnv
 from lerobot_wmrl.envs.tensor_env import Outcome, TensorEnv

@@ -49,10 +49,6 @@ class WorldModelVectorEnv(TensorEnv):
 
     refuses_nan_first = False
 
-    compact = False
-    """Whether observations have squares in place of frames of the dataset's size, which may be much larger to
-    store. `model.shown` makes them what a policy sees."""
-
     def __init__(
         self, model: ActionWorldModelRewardModel, starts: Starts, goals: GoalFeatures | None,
         reward: Reward, config: WorldModelEnv, n_envs: int,
@@ -60,7 +56,7 @@ class WorldModelVectorEnv(TensorEnv):
         self.model, self.starts, self.goals = model, starts, goals
         self.reward, self.config = reward, config
         self.num_envs, self.max_episode_steps = n_envs, config.horizon
-        self.device = starts.images.device
+        self.device, self._compact = starts.images.device, False
         embodiment = model.config.embodiment
         self.metadata = {"render_fps": embodiment.fps, "autoreset_mode": AutoresetMode.SAME_STEP}
         self.action_low, self.action_high = model.action_range()
@@ -209,10 +205,16 @@ class WorldModelVectorEnv(TensorEnv):
             "goal_reached": self.goals.reached[self._start_index],
         }
 
+    def store_compact(self) -> Callable[[Observation], Observation]:
+        """Show squares in place of frames of the dataset's size, which may be much larger to store, from now
+        on; return what makes such an observation what a policy sees."""
+        self._compact = True
+        return lambda observation: self.model.shown(observation)  # of the model that Dyna may have refreshed
+
     def _observe(
         self, images: Tensor, state: Tensor, instructions: Sequence[str] | None = None
     ) -> Observation:
-        made = self.model.compact_observation if self.compact else self.model.observation
+        made = self.model.compact_observation if self._compact else self.model.observation
         return made(images, state, self._instructions if instructions is None else instructions)
 
 

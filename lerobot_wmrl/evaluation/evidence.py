@@ -172,18 +172,21 @@ def trained_inside(policy: str, world_model: str) -> str | None:
 def learnt_from(world_model: str, rollouts: LabelledRollouts) -> int:
     """Return how many of the rollouts the world model has learnt from, themselves or as copies.
 
-    Trainings that it was continued from count too, as far as their settings and data lie on this machine.
+    Trainings that it was continued from count too, and that of a tokenizer which tells success, as far as
+    their settings and data lie on this machine.
     """
     sources = [settings.get("dataset") or {} for _, settings in _trainings(world_model, "model")]
     learnt = [(root, source.get("episodes")) for source in sources for root in _folders(source, rollouts)]
     learnt += [(str(more), None) for source in sources for more in source.get("more", ())]
-    table, chosen = rollouts.table, rollouts.chosen
-    same = [_same(Path(root), rollouts.root) for root, _ in learnt]
-    if any(same):
-        parts = [table.training(episodes) for (_, episodes), equal in zip(learnt, same, strict=True) if equal]
-        return int(np.any(parts, axis=0)[chosen].sum())
-    digests = (digest for root, episodes in learnt for digest in learnt_digests(Path(root), episodes))
-    return len(action_digests(table, chosen) & {*digests})
+    table, elsewhere = rollouts.table, set[str]()
+    themselves = np.zeros(len(table.start), bool)
+    for root, episodes in learnt:
+        if _same(Path(root), rollouts.root):
+            themselves |= table.training(episodes)
+        else:
+            elsewhere |= set(learnt_digests(Path(root), episodes))
+    copied = [digest in elsewhere for digest in action_digests(table, rollouts.chosen)]
+    return int((themselves[rollouts.chosen] | np.array(copied, bool)).sum())
 
 
 def _folders(source: Mapping[str, Any], rollouts: LabelledRollouts) -> list[str]:
@@ -195,19 +198,20 @@ def _folders(source: Mapping[str, Any], rollouts: LabelledRollouts) -> list[str]
     return [str(rollouts.root)] if repo_id == rollouts.name else [str(path) for path in local_copies(repo_id)]
 
 
-def learnt_digests(root: Path, episodes: Sequence[int] | None) -> set[str]:
+def learnt_digests(root: Path, episodes: Sequence[int] | None) -> list[str]:
     """Return `action_digests` of a dataset's chosen episodes that are not held out. There are none if it is
     not here, or not whole."""
     try:
-        table = read_episodes(open_dataset(root))
+        table = read_episodes(open_dataset(root, episodes=episodes))
     except FieldError:
-        return set()
+        return []
     return action_digests(table, np.flatnonzero(table.training(episodes)))
 
 
-def action_digests(table: EpisodeTable, episodes: np.ndarray) -> set[str]:
-    """Return digests of the actions of these episodes (E,): copies keep them, whatever columns they lose."""
-    return {sha256(table.action[rows].astype("<f4").tobytes()).hexdigest() for rows in table.rows(episodes)}
+def action_digests(table: EpisodeTable, episodes: np.ndarray) -> list[str]:
+    """Return a digest of the actions of each of these episodes (E,): copies keep them, whatever columns they
+    lose."""
+    return [sha256(table.action[rows].astype("<f4").tobytes()).hexdigest() for rows in table.rows(episodes)]
 
 
 def _trainings(checkpoint: str, trained: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
@@ -215,12 +219,24 @@ def _trainings(checkpoint: str, trained: str) -> Iterator[tuple[str, Mapping[str
 
     trained: name of the settings of what was trained, `policy` or `model`.
     """
-    visited = set()
-    while checkpoint and checkpoint not in visited:
+    visited, ahead = set(), [checkpoint]
+    while ahead:
+        if (checkpoint := ahead.pop(0)) in visited:
+            continue
         visited.add(checkpoint)
         settings = stored_settings(model_folder(checkpoint) / RUN_CONFIG_FILE)
         yield checkpoint, settings
-        checkpoint = str((settings.get(trained) or {}).get("pretrained_path") or "")
+        made = settings.get(trained) or {}
+        if began := made.get("pretrained_path"):
+            ahead.append(str(began))
+        if (tokenizer := made.get("tokenizer_path")) and tells_success(tokenizer):
+            ahead.append(str(tokenizer))
+
+
+def tells_success(tokenizer: str) -> bool:
+    """Return whether a tokenizer has learnt from labels: its world models read success by its classifier."""
+    config = stored_settings(model_folder(tokenizer) / "config.json")
+    return bool((config.get("tokenizer") or {}).get("success"))
 
 
 def stored_settings(path: Path) -> dict[str, Any]:

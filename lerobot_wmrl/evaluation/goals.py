@@ -150,7 +150,7 @@ def final_frames(tokenizer: FrameTokenizer, recording: Recording) -> Finals | No
 def final_rows(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Return at most `MAX_FINALS` successful episodes and the rows of their first frames with success."""
     table = recording.table
-    episodes = table.success.nonzero()[0]
+    episodes = (table.success & recording.readable).nonzero()[0]
     episodes = episodes[evenly_spaced(len(episodes), MAX_FINALS)]
     rows = [
         min(each.start + int(table.done[each].argmax()) + 1, each.stop - 1) for each in table.rows(episodes)

@@ -48,6 +48,11 @@ class Recording:
         cameras, size = model.config.tokenizer.camera_keys, model.config.tokenizer.image_size
         return cls(table, cached_frames(table.dataset, cameras, size), chosen)
 
+    @property
+    def readable(self) -> np.ndarray:
+        """Mask of the episodes whose frames may be read. (E,)"""
+        return np.ones(len(self.table.start), bool) if self.chosen is None else self.chosen
+
     def rows(self, episode: int) -> slice:
         """Return the rows of an episode."""
         (rows,) = self.table.rows([episode])

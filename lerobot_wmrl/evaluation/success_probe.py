@@ -84,10 +84,10 @@ def train_probe(tokenizer: FrameTokenizer, recording: Recording) -> TrainedProbe
     """Train on as many frames with success as without, of the recording's chosen episodes, with a fixed seed.
     None if a class is empty."""
     held_out = held_out_from_probe(np.arange(len(recording.table.start)))
-    chosen = np.ones_like(held_out) if recording.chosen is None else recording.chosen
     rng = np.random.default_rng(0)
     training, test = (
-        labelled_frames(tokenizer, recording, part & chosen, rng) for part in (~held_out, held_out)
+        labelled_frames(tokenizer, recording, part & recording.readable, rng)
+        for part in (~held_out, held_out)
     )
     if training is None:
         return None

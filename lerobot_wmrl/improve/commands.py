@@ -9,10 +9,10 @@ from typing import Final
 
 import numpy as np
 
-from lerobot_wmrl.common.constants import EVALUATION_SEED, SELECTION_SEED
 from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.lerobot_commands import edit_command, env_flags, merge_command, train_command
 from lerobot_wmrl.common.presets import Flags, format_flags, format_lerobot_flags
+from lerobot_wmrl.common.seeds import EVALUATION_SEED, SELECTION_SEED
 from lerobot_wmrl.common.stages import Stage, never
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET
@@ -173,7 +173,7 @@ def rl(progress: Progress) -> list[str]:
 
 
 def distilled(progress: Progress) -> list[str]:
-    return train(progress, "distilled", progress.fitted(), {
+    return train(progress, "distilled", progress.distillation_start(), {
         "gate.action": "off", "algorithm.type": "distillation", "algorithm.recorded": False,
     })  # fmt: skip
 
@@ -243,7 +243,8 @@ def sized_command(plan: Plan, program: str, flags: Flags) -> list[str]:
 
 
 def drive(progress: Progress) -> list[str]:
-    """Return the command that shows the world model in the browser, of several tasks with the first one."""
+    """Return the command that shows the world model and the policy to use in the browser; of several tasks it
+    opens the first."""
     plan, env = progress.plan, progress.plan.config.real_env
     if isinstance(env, WmrlManiSkillEnv):
         env = replace(env, task=env.task_names[0])

@@ -9,11 +9,11 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.command_line import RunConfig
-from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice, require_share
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.policy_checks import require_chunks, require_distillable, require_trained
 from lerobot_wmrl.common.presets import Flags
+from lerobot_wmrl.common.seeds import EVALUATION_SEED, require_seed
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
@@ -127,10 +127,7 @@ class ImproveConfig(RunConfig):
         if self.max_frames is not None:
             self._check_max_frames()
         last = EVALUATION_SEED - (self.rollouts + ROLLOUT_SEED_OFFSET if self.rollouts else 1)
-        if not 0 <= self.seed <= last:
-            raise FieldError(
-                "seed", self.seed, f"must be from 0 to {last}, so that no evaluation seed is trained on"
-            )
+        require_seed(self, last)
 
     def _check_max_frames(self) -> None:
         require_at_least(self, 1, "max_frames")

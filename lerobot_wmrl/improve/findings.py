@@ -46,7 +46,7 @@ class Findings:
         cameras: names of the cameras that the policy looks at.
         frame_side: the shorter side of their frames in pixels.
         pixels: pixels of all these cameras' frames.
-        held_out: how many of them are held out from training.
+        held_out: how many episodes are held out from training.
         held_out_tell: whether some of these succeed and some fail.
         tasks: how many tasks there are, as far as the dataset says.
         fewest: how many episodes there are of the task that has the fewest.
@@ -133,12 +133,12 @@ def require_improvable(
     require_shown(table, range(len(table.start)))
 
 
-def look(
+def inspect_dataset(
     table: EpisodeTable, policy: PreTrainedConfig, episodes: Sequence[int] | None, rollouts: int = 0
 ) -> Findings:
     """Describe the chosen episodes of a dataset, and check that a policy can be improved with them.
 
-    rollouts: that will be recorded too; failures are counted when they are there.
+    rollouts: number that will be recorded too. With any, warnings about failures wait for them.
 
     Raises:
         FieldError: the policy cannot be improved with it.

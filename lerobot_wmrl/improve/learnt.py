@@ -56,8 +56,8 @@ class LearntEpisodes:
         return int(np.unique(table.column(START_TASK)[begun], return_counts=True)[1].min())
 
     def evenly_chosen(self, starts: int) -> int:
-        """Return how many starts imagination takes in a comparison on `starts` of them: those of as many
-        episodes, spread evenly over the dataset. Of several tasks it takes all, because some may have few."""
+        """Return `max_starts` of imagination for a comparison on the starts of as many episodes, spread
+        evenly over the dataset. Of several tasks it takes all, because some may have few."""
         tasks = self.plan.findings.tasks
         if self.plan.config.rollouts:
             tasks = len(np.unique(self.chosen().column(START_TASK)))

@@ -22,7 +22,7 @@ from lerobot_wmrl.data.episodes import SUCCESS, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.lerobot_env import check_frame_rate, check_real_env
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
-from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, look, require_mergeable
+from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, inspect_dataset, require_mergeable
 from lerobot_wmrl.improve.own_cameras import with_own_cameras, without_renaming
 from lerobot_wmrl.improve.sizes import Sizes
 from lerobot_wmrl.maniskill.recordings import require_unreported
@@ -74,7 +74,7 @@ class Plan:
         preprocessor, postprocessor = load_processors(config.policy)
         policy = with_own_cameras(config.policy, preprocessor, table.dataset.features)
         adapted = without_renaming(preprocessor, policy) if policy is not config.policy else None
-        findings = look(table, policy, config.dataset.episodes, config.rollouts)
+        findings = inspect_dataset(table, policy, config.dataset.episodes, config.rollouts)
         chosen = np.flatnonzero(table.among(config.dataset.episodes))
         require_unreported(table, chosen, "choose others with `dataset.episodes`")
         if config.rollouts and isinstance(config.real_env, WmrlManiSkillEnv):
@@ -209,7 +209,8 @@ class Plan:
         )
 
     def strict_criterion(self) -> Flags:
-        """Return when the check sees success, and imagination too unless that recognises nothing."""
+        """Return the success criterion of the check. Imagination has it too, unless it recognises none of the
+        recorded successes."""
         return {
             "done_threshold": STRICT_DONE_THRESHOLD,
             "done_frames": min(STRICT_DONE_FRAMES, max(1, self.findings.held)),

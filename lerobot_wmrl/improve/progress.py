@@ -79,8 +79,9 @@ class Progress:
         results = read_json(self.plan.out / stage / COMPARISON_FILE)
         return titles[[*results["policies"]].index(decide(results))]
 
-    def fitted(self) -> str:
-        """Return the policy that is fitted to a planner after PPO: PPO's, or that before if it left none."""
+    def distillation_start(self) -> str:
+        """Return the policy that distillation begins with: PPO's checkpoint, else the policy that PPO began
+        with."""
         return str(self.plan.rl_checkpoint) if self.has_trained else self.policies[self.start()]
 
     def relaxed_criterion(self) -> dict[str, Any] | None:

@@ -9,7 +9,7 @@ from typing import Any, Final
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE, Comparison, episodes_from_json
 from lerobot_wmrl.rl.callbacks import RECORD_FILE, Record
-from lerobot_wmrl.rl.gate import SuccessGate
+from lerobot_wmrl.rl.gate_callback import SuccessGate
 from lerobot_wmrl.rl.selection import Selection
 
 CHECK: Final = "check/metrics.json"

@@ -2,13 +2,9 @@
 
 import numpy as np
 
-from lerobot_wmrl.common.constants import (
-    EVALUATION_SEED,
-    SELECTION_SEED,
-    START_SCENE,
-    START_SEED,
-)
+from lerobot_wmrl.common.constants import START_SCENE, START_SEED
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.seeds import EVALUATION_SEED, SELECTION_SEED
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.maniskill.scenes import scenes_of
 

@@ -51,7 +51,7 @@ class World:
         config: configuration of the imagined episodes.
         criterion: what makes a success; an episode is judged by it even where it does not end.
         table: table of the dataset in whose frames episodes can begin.
-        policy: that can act.
+        policy: a policy that the page offers as a driver; may be left out.
         real_env: that takes the same actions, and whose resets episodes can begin in.
     """
 
@@ -250,7 +250,7 @@ def load_world(
     Args:
         config: configuration of the imagined episodes.
         dataset: episodes in whose frames they can begin, if it is given.
-        policy: that can act.
+        policy: a policy that the page offers as a driver; may be left out.
         real_env: that takes the same actions.
         end_at_success: whether an episode ends when it succeeds.
 

@@ -5,7 +5,7 @@ LeRobot finds the classes by the names of this module and of its neighbours: `mo
 """
 
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.optim.optimizers import AdamWConfig
@@ -124,7 +124,7 @@ class EmbeddingConfig(LearnedRewardConfig):
         if self.world_model_path and not self.clip_length:
             from lerobot_wmrl.world_models.checkpoint import read_config
 
-            model: Any = read_config(self.world_model_path, "action_world_model")
+            model = read_config(self.world_model_path, "action_world_model")
             self.clip_length = model.clip_length
 
     @property

@@ -7,13 +7,11 @@ from typing import Final
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice, require_share, within
+from lerobot_wmrl.common.seeds import DYNA_SEEDS
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 
 GATE_ACTIONS: Final = ("stop", "warn", "off")
-
-DYNA_SEEDS: Final = 100_000
-"""Number of seeds just below EVALUATION_SEED that Dyna records on: a world model is not evaluated on them."""
 
 
 @dataclass

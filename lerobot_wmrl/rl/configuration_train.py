@@ -10,10 +10,13 @@ from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
+from lerobot_wmrl.common.checkpoints import UNPUBLISHED
 from lerobot_wmrl.common.command_line import RunConfig
-from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, within
 from lerobot_wmrl.common.hub import published_name
+from lerobot_wmrl.common.output_folders import RUN_CONFIG_FILE
+from lerobot_wmrl.common.policies import adapter_config, read_policy_config
+from lerobot_wmrl.common.seeds import require_seed
 from lerobot_wmrl.rl.configuration_algorithms import AlgorithmConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
 
@@ -101,23 +104,16 @@ class TrainConfig(CallbackSettings, RunConfig):
             raise FieldError("env.type", None, "is missing", "choose world_model, or another environment")
         require_at_least(self, 1, "num_envs", "iterations", "save_freq", "log_freq")
         self.algorithm.check(self.num_envs, self.iterations, self.env)
-        if not 0 <= self.seed < EVALUATION_SEED:
-            raise FieldError(
-                "seed", self.seed, f"must be from 0 to {EVALUATION_SEED - 1}; those above are for evaluation"
-            )
+        require_seed(self)
         self.check_callbacks(self.env, self.iterations)
 
 
-def load_config(cfg: TrainConfig) -> PreTrainedConfig:
+def resolve_policy(cfg: TrainConfig) -> PreTrainedConfig:
     """Read the policy's configuration into `cfg` and return it.
 
     A run that is continued by its stored configuration has the policy's settings from there. Whether and
     where the policy is published never comes from the checkpoint, as it would overwrite the SFT policy.
     """
-    from lerobot_wmrl.common.checkpoints import UNPUBLISHED
-    from lerobot_wmrl.common.output_folders import RUN_CONFIG_FILE
-    from lerobot_wmrl.common.policies import read_policy_config
-
     (typed, overrides), stored = cfg.given["policy"], cfg.policy
     path = typed or (stored and stored.pretrained_path)
     if not path:
@@ -143,8 +139,6 @@ def load_config(cfg: TrainConfig) -> PreTrainedConfig:
 
 def require_published_base(cfg: TrainConfig, policy: PreTrainedConfig) -> None:
     """Raise FieldError if adapters are to be published and what they adapt is a folder of this machine."""
-    from lerobot_wmrl.common.policies import adapter_config
-
     base = policy.pretrained_path if cfg.peft is not None else None
     if policy.use_peft:
         base = adapter_config(policy).base_model_name_or_path

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from lerobot.rl.algorithms.base import RLAlgorithm
 from lerobot.rl.algorithms.configs import TrainingStats
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -24,10 +23,16 @@ from lerobot_wmrl.common.distributed import (
 )
 from lerobot_wmrl.common.errors import FieldError, TrainingStopped
 from lerobot_wmrl.common.pipeline import Pipeline
-from lerobot_wmrl.common.policies import load_trained_weights
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
+from lerobot_wmrl.rl.algorithm import Algorithm
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
-from lerobot_wmrl.rl.labels import Labels, Windows, imagined_labels, recorded_successes, require_memory
+from lerobot_wmrl.rl.expert_labels import (
+    ExpertLabels,
+    Windows,
+    imagined_labels,
+    recorded_successes,
+    require_memory,
+)
 from lerobot_wmrl.rl.observations import as_read_back
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.seeds import seeded_noise
@@ -50,7 +55,7 @@ class Demonstrated(NamedTuple):
     metrics: dict[str, float]
 
 
-class Distillation(RLAlgorithm):
+class Distillation(Algorithm):
     """Fit a policy to a planner's actions in states that the policy leads to (DAgger, Ross et al. 2011).
 
     In each iteration the policy acts for some steps, and then the planner until success or the end. Its
@@ -66,11 +71,10 @@ class Distillation(RLAlgorithm):
     config_class = DistillationConfig
     name = "distillation"
     config: DistillationConfig
-    iteration: int
-    """Rollouts that were trained on."""
 
     def __init__(self, policy: Any, config: DistillationConfig, output_dir: Path) -> None:
-        self.lerobot_policy, self.config, self.iteration = policy, config, 0
+        super().__init__(policy)
+        self.config = config
         self.preset = policy.config.get_optimizer_preset()
         if self.preset is None:
             raise FieldError(
@@ -79,7 +83,7 @@ class Distillation(RLAlgorithm):
         self.parameters = [each for each in policy.parameters() if each.requires_grad]
         self.optimizer = self.make_optimizers_and_scheduler()[self.name]
         self.windows = Windows.of(policy.config)
-        self.labels = Labels(output_dir / LABELS_FOLDER, rank_and_size()[0])
+        self.labels = ExpertLabels(output_dir / LABELS_FOLDER, rank_and_size()[0])
 
     def make_optimizers_and_scheduler(self) -> dict[str, Optimizer]:
         """Return the policy's own optimizer in lerobot-train, at a constant rate."""
@@ -87,7 +91,7 @@ class Distillation(RLAlgorithm):
 
     def load_weights(self, weights: dict[str, Any], device: str | torch.device = "cpu") -> None:
         """Load the policy's weights from a checkpoint, and the labels of the iterations before it."""
-        load_trained_weights(self.lerobot_policy, weights)
+        super().load_weights(weights, device)
         self.labels.load(self.iteration)
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -100,15 +104,6 @@ class Distillation(RLAlgorithm):
     def iterate(
         self, env: WorldModelVectorEnv, pipeline: Pipeline, rollout: RolloutBuffer, seed: int, last: bool
     ) -> dict[str, float]:
-        """Collect labels, fit the policy, and return metrics.
-
-        Args:
-            env: the world model.
-            pipeline: the policy's processors.
-            rollout: gives the number of steps and holds the observations.
-            seed: seed of this process's first environment in this iteration.
-            last: whether this is the training's last iteration.
-        """
         started = time.perf_counter()
         if self.config.recorded and not self.labels.recorded:
             model = env.model.config
@@ -209,8 +204,8 @@ class Distillation(RLAlgorithm):
             return torch.ones_like(deviation, dtype=torch.bool)
         return pipeline.action_unit.to(env.device) >= LEAST_STD_SHARE * deviation
 
-    def check_recorded(self, env: WorldModelVectorEnv, pipeline: Pipeline) -> None:
-        """Raise FieldError if recorded episodes are learnt from, and do not fit into memory or vary in what
+    def check_dataset(self, env: WorldModelVectorEnv, pipeline: Pipeline) -> None:
+        """Raise FieldError if recorded successes are learnt from, and do not fit into memory or vary in what
         the policy cannot learn."""
         if not self.config.recorded:
             return

@@ -12,16 +12,17 @@ from typing import Final
 
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
-from lerobot_wmrl.common.constants import DYNA, EVALUATION_SEED
+from lerobot_wmrl.common.constants import DYNA
 from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.precision import device_setting
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
+from lerobot_wmrl.common.seeds import dyna_seed
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
 from lerobot_wmrl.data.ledger import budget_flags
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, record_folder
-from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS, DynaConfig
+from lerobot_wmrl.rl.configuration_callbacks import DynaConfig
 from lerobot_wmrl.rl.recorders import Recorder
 from lerobot_wmrl.world_models.checkpoint import load_model
 
@@ -32,7 +33,7 @@ noisy episodes alone calls failures of the noise-free policy successes."""
 LEARNING_RATE: Final = 3e-4
 """Peak learning rate of a round, below that of a training from scratch."""
 
-WORLD_MODEL = "action_world_model"
+WORLD_MODEL: Final = "action_world_model"
 
 
 def round_iterations(rounds: int, iterations: int) -> list[int]:
@@ -111,7 +112,7 @@ class DynaRounds:
         """Return the seed of the first episode of one half, 0 or 1, of a round's recording."""
         n_episodes = self.config.n_episodes
         place = (self.seed * self.config.rounds + number) * n_episodes + half * (n_episodes // 2)
-        return EVALUATION_SEED - DYNA_SEEDS + place % (DYNA_SEEDS - n_episodes)
+        return dyna_seed(place, n_episodes)
 
     def _earlier(self, iteration: int) -> list[str]:
         """Return the datasets of earlier rounds."""

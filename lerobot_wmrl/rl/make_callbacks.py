@@ -5,9 +5,9 @@ from functools import partial
 
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_wmrl.common.constants import SELECTION_SEED
 from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.common.precision import device_setting
+from lerobot_wmrl.common.seeds import SELECTION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.lerobot_env import is_own
@@ -19,7 +19,7 @@ from lerobot_wmrl.rl.callbacks import Callback
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings, SelectionConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
 from lerobot_wmrl.rl.dyna import DynaRounds, round_iterations
-from lerobot_wmrl.rl.gate import SuccessGate
+from lerobot_wmrl.rl.gate_callback import SuccessGate
 from lerobot_wmrl.rl.recorders import EnvRecorder, ManiSkillRecorder, Recorder
 from lerobot_wmrl.rl.selection import IMAGINED, REAL, Measure, Selection
 

@@ -8,14 +8,13 @@ import logging
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import torch
 import torch.nn.functional as F
-from lerobot.rl.algorithms.base import RLAlgorithm
 from lerobot.rl.algorithms.configs import TrainingStats
 from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
@@ -31,8 +30,9 @@ from lerobot_wmrl.common.distributed import (
 )
 from lerobot_wmrl.common.errors import FieldError, TrainingStopped, within
 from lerobot_wmrl.common.pipeline import Pipeline, unchanged
-from lerobot_wmrl.common.policies import frozen_copy, load_trained_weights
+from lerobot_wmrl.common.policies import frozen_copy
 from lerobot_wmrl.common.precision import require_exact_updates
+from lerobot_wmrl.rl.algorithm import Algorithm
 from lerobot_wmrl.rl.compatibility import check_std, require_encoder
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
 from lerobot_wmrl.rl.minibatches import Batch, Minibatch, Minibatches, read_batch
@@ -47,18 +47,10 @@ from lerobot_wmrl.rl.objective import (
 from lerobot_wmrl.rl.observations import as_read_back
 from lerobot_wmrl.rl.policy_adapters import as_stochastic
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
+from lerobot_wmrl.rl.trust_region import TrustRegion
 
 GRAD_CLIP_NORM = 1.0
 """Largest gradient norm, of the policy's parameters and of the value's separately."""
-
-UNDONE_KL = 10.0
-"""A step that moves the policy by more than this many times `target_kl` is undone."""
-
-LEAST_LR_FACTOR = 0.1
-"""The least factor by which the learning rate falls then. Estimates of a large KL are far too large."""
-
-LR_RECOVERY = 1.1
-"""Factor by which it rises again, up to `policy_lr`, in each iteration that stays within `target_kl`."""
 
 POLICY = "policy"
 """The parameter group of the policy."""
@@ -67,10 +59,10 @@ REFERENCE, EXECUTED = "reference_log_prob", "executed"
 RATIO_ERROR, LOSS, NORM = "ratio_error", "_loss", "_grad_norm"
 
 
-class PolicyGradient(RLAlgorithm):
+class PolicyGradient(Algorithm):
     """Ascent on a clipped objective, with a KL penalty towards the SFT policy, the frozen `reference`.
 
-    An iteration is `rollout.collect`, `prepare`, then `update`. Subclasses say what the advantages
+    An iteration is `rollout.collect`, `make_minibatches`, then `update`. Subclasses say what the advantages
     are (`add_targets`) and what else is in the loss (`losses`).
 
     Args:
@@ -81,8 +73,6 @@ class PolicyGradient(RLAlgorithm):
     """
 
     config: PolicyGradientConfig
-    iteration: int
-    """Rollouts that were trained on."""
 
     unrewarded: Tensor
     """Rollouts in a row, up to the latest, without a signal. () int64"""
@@ -91,8 +81,8 @@ class PolicyGradient(RLAlgorithm):
     """What a rollout without a signal is like."""
 
     def __init__(self, policy: Any, config: PolicyGradientConfig) -> None:
-        self.lerobot_policy, self.policy = policy, as_stochastic(policy)
-        self.config, self.iteration = config, 0
+        super().__init__(policy)
+        self.policy, self.config = as_stochastic(policy), config
         self.unrewarded = torch.zeros((), dtype=torch.int64)
         if config.initial_std is not None:
             check_std(policy, self.policy, config.initial_std)
@@ -116,6 +106,8 @@ class PolicyGradient(RLAlgorithm):
             )  # fmt: skip
         require_exact_updates(self.policy_parameters)
         self.optimizer = self.make_optimizers_and_scheduler()[self.name]
+        group = list(self.parameter_groups()).index(POLICY)
+        self.trust_region = TrustRegion(self.policy_parameters, self.optimizer, group, config.target_kl)
 
     @property
     def group_size(self) -> int:
@@ -130,14 +122,6 @@ class PolicyGradient(RLAlgorithm):
         """Return AdamW with a constant rate for each parameter group."""
         groups = [{"params": params, "lr": rate} for params, rate in self.parameter_groups().values()]
         return {self.name: AdamW(groups, weight_decay=0.0)}
-
-    def get_optimizers(self) -> dict[str, Optimizer]:
-        """Return the optimiser in use, with its moments; `make_optimizers_and_scheduler` makes a new one."""
-        return {self.name: self.optimizer}
-
-    def load_weights(self, weights: dict[str, Any], device: str | torch.device = "cpu") -> None:
-        """Load a checkpoint's weights into `lerobot_policy`. Reference and adapter stay as they are."""
-        load_trained_weights(self.lerobot_policy, weights)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the tensors that the policy's own checkpoint lacks, its adapter's among them. Subclasses add
@@ -207,13 +191,12 @@ class PolicyGradient(RLAlgorithm):
     def iterate(
         self, env: gym.vector.VectorEnv, pipeline: Pipeline, rollout: RolloutBuffer, seed: int, last: bool
     ) -> dict[str, float]:
-        """Collect one rollout with the seeds from `seed` on, update the policy on it, and return metrics."""
         started = time.perf_counter()
-        pipeline = self.encoding(pipeline)
+        pipeline = self.with_frozen_encoder(pipeline)
         collected = collect(env, self.policy, pipeline, rollout, seed, self.group_size)
         rollout_end = time.perf_counter()
         self.check_signal(rollout)
-        minibatches, targets = self.prepare(rollout, pipeline)
+        minibatches, targets = self.make_minibatches(rollout, pipeline)
         progress = tqdm(minibatches, "update", leave=False, unit="minibatch", disable=hidden_progress())
         stats = self.update(iter(progress))
         progress.close()
@@ -225,7 +208,7 @@ class PolicyGradient(RLAlgorithm):
             "update_s": time.perf_counter() - rollout_end,
         }
 
-    def encoding(self, pipeline: Pipeline) -> Pipeline:
+    def with_frozen_encoder(self, pipeline: Pipeline) -> Pipeline:
         """Return a pipeline that stores what the encoder makes of observations, where it does not learn."""
         if self.config.train_encoder:
             return pipeline
@@ -236,7 +219,9 @@ class PolicyGradient(RLAlgorithm):
 
         return replace(pipeline, prepare=unchanged, store=store)
 
-    def prepare(self, rollout: RolloutBuffer, pipeline: Pipeline) -> tuple[Minibatches, dict[str, float]]:
+    def make_minibatches(
+        self, rollout: RolloutBuffer, pipeline: Pipeline
+    ) -> tuple[Minibatches, dict[str, float]]:
         """Compute advantages and the reference's log-probabilities; return minibatches for `update`, and
         metrics.
 
@@ -269,63 +254,48 @@ class PolicyGradient(RLAlgorithm):
         """Take one optimiser step on each minibatch, until the KL to the rollout's policy exceeds
         `target_kl`. A step that is much too long is undone, and the next ones are shorter for a while."""
         records: list[dict[str, float]] = []
-        first, within_target = self.optimization_step, False
-        before: list[Tensor] = []  # the policy's parameters before the last step, if it was trained
+        first, within_target, region = self.optimization_step, False, self.trust_region
+        region.forget()
         for minibatch in batch_iterator:
             self.optimizer.zero_grad()
-            record = self.measure(minibatch)
-            if self.taken_back(before, record["kl"]):
+            record = self.measure(minibatch, backward=True)
+            if self.undone(record["kl"]):
                 break
             self.check_finite(record)
-            records.append({**record, "policy_lr": self.policy_group["lr"]})
+            records.append({**record, "policy_lr": region.group["lr"]})
             if record["kl"] > self.config.target_kl:
                 break
             if POLICY in self.trained_groups():
-                before = [parameter.detach().clone() for parameter in self.policy_parameters]
+                region.remember()
             records[-1] |= self.optimizer_step()
         else:
             within_target = True
-            if before:
-                with torch.no_grad():
-                    kl = self.measure(minibatch)["kl"]
-                within_target = not self.taken_back(before, kl) and kl <= self.config.target_kl
+            if region.has_stepped:
+                kl = self.measure(minibatch, backward=False)["kl"]
+                within_target = not self.undone(kl) and kl <= self.config.target_kl
+        region.forget()
         if within_target:
-            self.policy_group["lr"] = min(self.config.policy_lr, LR_RECOVERY * self.policy_group["lr"])
+            region.recover()
         self.iteration += 1
         return training_stats(records, self.optimization_step - first)
 
-    @property
-    def policy_group(self) -> dict[str, Any]:
-        """The optimiser's group of the policy, with its learning rate."""
-        group: dict[str, Any] = self.optimizer.param_groups[list(self.parameter_groups()).index(POLICY)]
-        return group
-
-    @torch.no_grad()
-    def taken_back(self, before: Sequence[Tensor], kl: float) -> bool:
-        """Return whether the last step has moved the policy much too far, and if so take it back.
-
-        The learning rate falls then, so that the next step comes to `target_kl`: the KL grows with the square
-        of a step. A KL that has overflowed is too far as well.
-        """
-        if not before or kl <= UNDONE_KL * self.config.target_kl:
+    def undone(self, kl: float) -> bool:
+        """Undo the last step if it has moved the policy much too far, and say so; return whether it did."""
+        if not self.trust_region.undo_if_exceeded(kl):
             return False
-        for parameter, old in zip(self.policy_parameters, before, strict=True):
-            parameter.copy_(old)
-        factor = max(LEAST_LR_FACTOR, math.sqrt(self.config.target_kl / kl))  # the former for NaN too
-        self.policy_group["lr"] *= factor
         logging.info(
             "iteration %d: one step has moved the policy by %.3g nats, and is undone; its learning rate is "
-            "now %.2g", self.iteration + 1, kl, self.policy_group["lr"],
+            "now %.2g", self.iteration + 1, kl, self.trust_region.group["lr"],
         )  # fmt: skip
         return True
 
-    def measure(self, minibatch: Minibatch) -> dict[str, float]:
-        """Return the metrics of a minibatch, and accumulate the gradient of its mean loss over micro-batches
-        where gradients are computed."""
+    def measure(self, minibatch: Minibatch, backward: bool) -> dict[str, float]:
+        """Return the metrics of a minibatch; with `backward` accumulate the gradient of its mean loss too."""
         parts: list[dict[str, Tensor]] = []
         for counted, batch in minibatch.micro_batches():
-            loss, record = self.losses(batch)  # (B,), (B,) by name; rows from `counted` on do not count
-            if torch.is_grad_enabled():
+            with torch.set_grad_enabled(backward):
+                loss, record = self.losses(batch)  # (B,), (B,) by name; rows from `counted` on do not count
+            if backward:
                 loss[:counted].sum().div(minibatch.size).backward()
             parts.append({name: value.detach()[:counted] for name, value in record.items()})
         joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

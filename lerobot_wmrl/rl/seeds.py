@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import torch
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
 
-from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 
 NOISE_SEED = 2**31
 """Added to a rollout's seed for the policy's noise, so that it differs from the environment's."""

@@ -9,10 +9,16 @@ from typing import Any, Final
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.checkpoints import best_model, last_model
-from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import within
+from lerobot_wmrl.common.hub import create_repo, published_name, publishing
+from lerobot_wmrl.common.lerobot_commands import env_flags
 from lerobot_wmrl.common.presets import format_lerobot_flags
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
+from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.rl.callbacks import read_record
 from lerobot_wmrl.rl.configuration_train import TrainConfig
+from lerobot_wmrl.rl.selection import Selection, success
+from lerobot_wmrl.world_models.hub_card import card_metadata
 
 PATHS: Final = ("path", "root", "frames", "assets")
 """Ends of the names of settings that may be folders or files of this machine."""
@@ -46,10 +52,6 @@ def chosen_checkpoint(cfg: TrainConfig) -> Path:
 
 def summary(cfg: TrainConfig) -> list[str]:
     """Return lines that say what was made, how good it is, and how to evaluate it."""
-    from lerobot_wmrl.common.tracking import read_metrics
-    from lerobot_wmrl.rl.callbacks import read_record
-    from lerobot_wmrl.rl.selection import Selection, success
-
     iterations = [line for line in read_metrics(cfg.output_dir) if "success_rate" in line]
     first, last, checkpoint = iterations[0], iterations[-1], chosen_checkpoint(cfg)
     policy, env, algorithm = cfg.policy.type, cfg.env.type, cfg.algorithm.type.upper()  # type: ignore[union-attr]
@@ -78,8 +80,6 @@ def evaluation(cfg: TrainConfig, path: str, shared: bool = False) -> str:
 
     `shared`: for others, who do not have this machine's folders.
     """
-    from lerobot_wmrl.common.lerobot_commands import env_flags
-
     evaluated: Any = cfg.real_env or cfg.env
     settings = dict(env_flags(evaluated))
     for name in settings if shared else ():
@@ -96,9 +96,6 @@ def publish(cfg: TrainConfig, lines: list[str]) -> None:
     if not config.push_to_hub:
         return
     from huggingface_hub import HfApi
-
-    from lerobot_wmrl.common.hub import create_repo, published_name, publishing
-    from lerobot_wmrl.world_models.hub_card import card_metadata
 
     api = HfApi()
     described = [lines[0].removeprefix(f"{cfg.output_dir}: "), *lines[1:-1]]

@@ -25,6 +25,7 @@ from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.common.tracking import Tracker
 from lerobot_wmrl.common.training_state import load_training_state, save_checkpoint
 from lerobot_wmrl.envs.tensor_env import TensorEnv
+from lerobot_wmrl.rl.algorithm import Algorithm
 from lerobot_wmrl.rl.callbacks import Callback, Callbacks
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
@@ -61,10 +62,7 @@ class Schedule:
     log_freq: int = 1
 
 
-TrainableAlgorithm = PolicyGradient | Distillation
-
-
-def make_algorithm(policy: Any, config: RLAlgorithmConfig, output_dir: Path) -> TrainableAlgorithm:
+def make_algorithm(policy: Any, config: RLAlgorithmConfig, output_dir: Path) -> Algorithm:
     """Return the algorithm that `config` describes, to train `policy` in `output_dir`."""
     if isinstance(config, DistillationConfig):
         return Distillation(policy, config, output_dir)
@@ -73,7 +71,7 @@ def make_algorithm(policy: Any, config: RLAlgorithmConfig, output_dir: Path) -> 
 
 
 def train(
-    env: gym.vector.VectorEnv, algorithm: TrainableAlgorithm, pipeline: Pipeline, rollout: RolloutBuffer,
+    env: gym.vector.VectorEnv, algorithm: Algorithm, pipeline: Pipeline, rollout: RolloutBuffer,
     schedule: Schedule, output_dir: Path, save_pretrained: Callable[[Path], None],
     callbacks: Sequence[Callback] = (), wandb: Any = None,
 ) -> None:  # fmt: skip
@@ -144,7 +142,7 @@ def saving_at_a_stop(
 
 def iterate(
     env: TensorEnv,
-    algorithm: TrainableAlgorithm,
+    algorithm: Algorithm,
     pipeline: Pipeline,
     rollout: RolloutBuffer,
     schedule: Schedule,
@@ -169,9 +167,7 @@ def make_tracker(
     return Tracker(output_dir, meters, SHOWN, schedule.log_freq, wandb)
 
 
-def save(
-    algorithm: TrainableAlgorithm, output_dir: Path, total: int, save_pretrained: Callable[[Path], None]
-) -> Path:
+def save(algorithm: Algorithm, output_dir: Path, total: int, save_pretrained: Callable[[Path], None]) -> Path:
     """Write a checkpoint of policy and algorithm, and return its folder."""
 
     def write_models(folder: Path) -> None:
@@ -181,7 +177,7 @@ def save(
     return save_checkpoint(output_dir, total, algorithm.iteration, write_models, algorithm.optimizer)
 
 
-def resume(algorithm: TrainableAlgorithm, output_dir: Path) -> Path | None:
+def resume(algorithm: Algorithm, output_dir: Path) -> Path | None:
     """Load the latest checkpoint in `output_dir`, if there is one, and return it."""
     checkpoint = newest_checkpoint(output_dir)
     if checkpoint is None:

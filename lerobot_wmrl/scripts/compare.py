@@ -16,21 +16,27 @@ finished batch. With early stopping `--n_episodes` may then be higher: the test 
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import draccus
+from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
+from lerobot_wmrl.common.checkpoints import checkpoint_digest
 from lerobot_wmrl.common.command_line import RunConfig, run_command
-from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice, require_probability
 from lerobot_wmrl.common.files import write_json, writing
 from lerobot_wmrl.common.output_folders import Claim
-
-if TYPE_CHECKING:
-    from lerobot.configs import PreTrainedConfig
-
-    from lerobot_wmrl.evaluation.comparison import Comparison, Episode
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
+from lerobot_wmrl.envs.content import content_of
+from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE, Comparison, Episode, episodes_from_json
+from lerobot_wmrl.evaluation.pictures import save_comparison
+from lerobot_wmrl.evaluation.policy_rollouts import (
+    load_policies,
+    opened,
+    read_policies,
+    require_new_starts,
+    run_comparison,
+)
 
 
 @dataclass
@@ -89,10 +95,6 @@ class CompareConfig(RunConfig):
 
 def compare(cfg: CompareConfig) -> None:
     """Run the policies, or what is missing of their episodes; write comparison.json and comparison.png."""
-    from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE, Comparison
-    from lerobot_wmrl.evaluation.pictures import save_comparison
-    from lerobot_wmrl.evaluation.policy_rollouts import read_policies
-
     cfg.validate()
     assert cfg.env is not None
     configs = read_policies(cfg.policies, cfg.env)
@@ -110,16 +112,11 @@ def compare(cfg: CompareConfig) -> None:
 
 def named_content(cfg: CompareConfig) -> dict[str, str]:
     """Return digests of the policies, and of what imagined episodes follow from."""
-    from lerobot_wmrl.common.checkpoints import checkpoint_digest
-    from lerobot_wmrl.envs.content import content_of
-
     return {name: checkpoint_digest(name) for name in cfg.policies} | content_of(cfg.env)
 
 
-def stored_episodes(cfg: CompareConfig) -> "list[Episode]":
+def stored_episodes(cfg: CompareConfig) -> list[Episode]:
     """Return the episodes that have run before."""
-    from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE, episodes_from_json
-
     results = cfg.output_dir / COMPARISON_FILE
     return episodes_from_json(json.loads(results.read_text())) if results.is_file() else []
 
@@ -131,17 +128,9 @@ def may_differ(cfg: CompareConfig) -> list[str]:
 
 
 def run(
-    cfg: CompareConfig, claim: Claim, comparison: "Comparison", configs: "dict[str, PreTrainedConfig]"
+    cfg: CompareConfig, claim: Claim, comparison: Comparison, configs: dict[str, PreTrainedConfig]
 ) -> None:
     """Run the episodes that are missing; write the results after every batch."""
-    from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE
-    from lerobot_wmrl.evaluation.policy_rollouts import (
-        load_policies,
-        opened,
-        require_new_starts,
-        run_comparison,
-    )
-
     assert cfg.env is not None
 
     def save() -> None:

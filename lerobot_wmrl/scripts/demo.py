@@ -11,16 +11,15 @@ again continues an interrupted demo. It ends with a summary and `report.html`.
 from dataclasses import asdict
 from functools import partial
 
+from lerobot_wmrl.common.output_folders import Claim
 from lerobot_wmrl.common.presets import expand_preset
+from lerobot_wmrl.common.stages import MARKER, run_stage_command, run_stages
 from lerobot_wmrl.demo.stages import Demo, DemoConfig, conclusion
+from lerobot_wmrl.maniskill.backend import require_simulator
 
 
 def run_demo(cfg: DemoConfig) -> None:
     """Run every stage, write the report, and say what came of it."""
-    from lerobot_wmrl.common.output_folders import Claim
-    from lerobot_wmrl.common.stages import MARKER, run_stages
-    from lerobot_wmrl.maniskill.backend import require_simulator
-
     cfg.validate()
     require_simulator()
     demo = Demo(cfg)
@@ -34,8 +33,6 @@ def run_demo(cfg: DemoConfig) -> None:
 
 def main() -> None:
     """Run the console command."""
-    from lerobot_wmrl.common.stages import run_stage_command
-
     run_stage_command(run_demo, DemoConfig, partial(expand_preset, command="demo"))
 
 

@@ -18,36 +18,61 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import draccus
+import numpy as np
+from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command
-from lerobot_wmrl.common.constants import DONE_FRAMES, DONE_THRESHOLD, EVALUATION_SEED
+from lerobot_wmrl.common.constants import DONE_FRAMES, DONE_THRESHOLD, START_SCENE
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_probability
+from lerobot_wmrl.common.files import write_json, write_text
+from lerobot_wmrl.common.hub import check_login
 from lerobot_wmrl.common.output_folders import Claim
+from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.common.presets import expand_preset, flag_as_typed
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.dataset import ChosenEpisodes
+from lerobot_wmrl.data.episodes import EpisodeTable, choose_episodes, read_episodes
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.envs.lerobot_env import check_real_env, frame_limit
+from lerobot_wmrl.envs.start_frames import chosen_episodes
+from lerobot_wmrl.evaluation.agreement import Agreement, policy_checkpoints
+from lerobot_wmrl.evaluation.evidence import LabelledRollouts, learnt_from
+from lerobot_wmrl.evaluation.gate import MAX_FALSE_POSITIVE_RATE
+from lerobot_wmrl.evaluation.pictures import save_reward_curves
+from lerobot_wmrl.evaluation.policy_rollouts import (
+    about_policy,
+    evaluate_policy,
+    opened,
+    read_policies,
+    run_policy,
+)
+from lerobot_wmrl.evaluation.reconstruction import reconstruction_metrics
+from lerobot_wmrl.evaluation.replay import Recording
+from lerobot_wmrl.evaluation.report import (
+    ReplayEvaluation,
+    Report,
+    evaluate,
+    report_action_model,
+    report_agreement,
+    report_goals,
+)
+from lerobot_wmrl.evaluation.reward_curves import reward_along_episode
+from lerobot_wmrl.maniskill.recordings import scene_splits
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
-
-if TYPE_CHECKING:
-    import numpy as np
-    from lerobot.configs import PreTrainedConfig
-
-    from lerobot_wmrl.data.episodes import EpisodeTable
-    from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-    from lerobot_wmrl.evaluation.agreement import Agreement
-    from lerobot_wmrl.evaluation.evidence import LabelledRollouts
-    from lerobot_wmrl.evaluation.replay import Recording
-    from lerobot_wmrl.evaluation.report import ReplayEvaluation, Report
-    from lerobot_wmrl.world_models.modeling_world_model import (
-        ActionWorldModelRewardModel,
-        TextWorldModelRewardModel,
-    )
-
+from lerobot_wmrl.world_models.checkpoint import check_dataset, check_same_tokenizer, load_model
+from lerobot_wmrl.world_models.hub_card import EVALUATION, publish_evaluation
+from lerobot_wmrl.world_models.modeling_world_model import (
+    ActionWorldModelRewardModel,
+    TextWorldModelRewardModel,
+)
+from lerobot_wmrl.world_models.training_data import require_readable_instructions
 
 IMAGINED_AT_ONCE, REAL_AT_ONCE = 50, 2
 """Episodes of a policy that run at once."""
@@ -129,14 +154,6 @@ class EvalWorldModelConfig(RunConfig):
 
 def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     """Check that all fits, then measure."""
-    from lerobot_wmrl.common.constants import START_SCENE
-    from lerobot_wmrl.common.hub import check_login
-    from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
-    from lerobot_wmrl.evaluation.evidence import LabelledRollouts
-    from lerobot_wmrl.evaluation.replay import Recording
-    from lerobot_wmrl.maniskill.recordings import scene_splits
-    from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model
-
     cfg.validate()
     if cfg.push_to_hub:
         check_login()
@@ -149,16 +166,17 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     scenes = scene_splits(table.column(START_SCENE), cfg.split)
     chosen = table.among(cfg.dataset.episodes)
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes, chosen)
+    for each in (model, text_model):
+        if each is not None:
+            require_readable_instructions(each, table.subset(episodes))
     with Claim(cfg.output_dir, draccus.encode(cfg)).held():
         warn_of_learnt(cfg.model.path, LabelledRollouts(cfg.dataset.name, table, episodes))
         recording = Recording.read(table, model, chosen)
         measure(cfg, model, text_model, recording, episodes, imagination, policies)
 
 
-def warn_of_learnt(world_model: str, rollouts: "LabelledRollouts") -> None:
+def warn_of_learnt(world_model: str, rollouts: LabelledRollouts) -> None:
     """Warn if the world model has learnt from the episodes that it is checked on."""
-    from lerobot_wmrl.evaluation.evidence import learnt_from
-
     if learnt := learnt_from(world_model, rollouts):
         logging.warning(
             "%s: the world model has learnt from %d of these %d episodes, and predicts them better than "
@@ -169,18 +187,14 @@ def warn_of_learnt(world_model: str, rollouts: "LabelledRollouts") -> None:
 
 def measure(
     cfg: EvalWorldModelConfig,
-    model: "ActionWorldModelRewardModel",
-    text_model: "TextWorldModelRewardModel | None",
-    recording: "Recording",
-    episodes: "np.ndarray",
-    imagination: "WorldModelEnv | None",
-    policies: "Mapping[str, PreTrainedConfig]",
+    model: ActionWorldModelRewardModel,
+    text_model: TextWorldModelRewardModel | None,
+    recording: Recording,
+    episodes: np.ndarray,
+    imagination: WorldModelEnv | None,
+    policies: Mapping[str, PreTrainedConfig],
 ) -> None:
     """Replay episodes, evaluate policies in imagination, write metrics.json, metrics.md and pictures."""
-    from lerobot_wmrl.common.files import write_json, write_text
-    from lerobot_wmrl.evaluation.reconstruction import reconstruction_metrics
-    from lerobot_wmrl.evaluation.report import evaluate, report_action_model, report_agreement
-
     evaluation = evaluate(model, recording, episodes, cfg.episode_length)
     reports = [report_action_model(model, recording, evaluation, cfg.criterion, cfg.output_dir)]
     if text_model is not None:
@@ -202,8 +216,6 @@ def measure(
 
 def publish(cfg: EvalWorldModelConfig, metrics: Mapping[str, Any], page: str, episodes: int) -> None:
     """Put what was found on the model's card, without paths of this machine."""
-    from lerobot_wmrl.world_models.hub_card import EVALUATION, publish_evaluation
-
     dataset = cfg.dataset.repo_id or Path(cfg.dataset.name).name
     pictures = sorted(cfg.output_dir.glob("comparison_*.gif"))
     summary = (
@@ -219,10 +231,8 @@ def publish(cfg: EvalWorldModelConfig, metrics: Mapping[str, Any], page: str, ep
     publish_evaluation(cfg.model.path, "\n\n".join(["## What it imagines", summary, *shown, page]), files)
 
 
-def conclusion(cfg: EvalWorldModelConfig, episodes: int, report: "Report") -> str:
+def conclusion(cfg: EvalWorldModelConfig, episodes: int, report: Report) -> str:
     """Say in a few lines what was found, where it is, and what comes next."""
-    from lerobot_wmrl.evaluation.gate import MAX_FALSE_POSITIVE_RATE
-
     metrics = report.metrics
     psnr, ceiling = (metrics["headline"][name]["value"] for name in ("psnr", "psnr_ceiling"))
     summary = (
@@ -254,31 +264,22 @@ def conclusion(cfg: EvalWorldModelConfig, episodes: int, report: "Report") -> st
 
 
 def load_text_model(
-    cfg: EvalWorldModelConfig, model: "ActionWorldModelRewardModel"
-) -> "TextWorldModelRewardModel | None":
+    cfg: EvalWorldModelConfig, model: ActionWorldModelRewardModel
+) -> TextWorldModelRewardModel | None:
     """Load the text world model if one is named. ValueError if its tokens are another tokenizer's."""
-    from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
-
     if not cfg.text_model.path:
         return None
-    text_model: TextWorldModelRewardModel = load_model(
-        cfg.text_model.path, "text_world_model", cfg.device, "text_model.path"
-    )
+    text_model = load_model(cfg.text_model.path, "text_world_model", cfg.device, "text_model.path")
     check_same_tokenizer(model, text_model, "text_model.path", cfg.text_model.path)
     return text_model
 
 
-def policies_imagination(cfg: EvalWorldModelConfig, table: "EpisodeTable") -> "WorldModelEnv":
+def policies_imagination(cfg: EvalWorldModelConfig, table: EpisodeTable) -> WorldModelEnv:
     """Return the world model as `policies` are evaluated in it, from starts of the environment's task.
 
     Raises:
         FieldError: nothing can be evaluated in it, or the dataset has too few starts.
     """
-    from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-    from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-    from lerobot_wmrl.envs.lerobot_env import frame_limit
-    from lerobot_wmrl.envs.start_frames import chosen_episodes
-
     tasks = cfg.real_env.task_names if isinstance(cfg.real_env, WmrlManiSkillEnv) else None
     if tasks is not None and len(tasks) > 1:
         raise FieldError(
@@ -305,18 +306,12 @@ def policies_imagination(cfg: EvalWorldModelConfig, table: "EpisodeTable") -> "W
     return imagination
 
 
-def checked_policies(
-    cfg: EvalWorldModelConfig, imagination: "WorldModelEnv"
-) -> "dict[str, PreTrainedConfig]":
+def checked_policies(cfg: EvalWorldModelConfig, imagination: WorldModelEnv) -> dict[str, PreTrainedConfig]:
     """Return the configurations of the policies by their checkpoints, checked before the long replay.
 
     Raises:
         FieldError: a policy cannot act in the world model, or not in `real_env`, of which one is made.
     """
-    from lerobot_wmrl.envs.lerobot_env import check_real_env
-    from lerobot_wmrl.evaluation.agreement import policy_checkpoints
-    from lerobot_wmrl.evaluation.policy_rollouts import about_policy, read_policies
-
     assert cfg.real_env is not None
     paths = [str(path) for path in policy_checkpoints(cfg.policies)]
     policies = dict(zip(paths, read_policies(paths, imagination).values(), strict=True))
@@ -327,13 +322,9 @@ def checked_policies(
 
 
 def policy_agreement(
-    cfg: EvalWorldModelConfig, imagination: "WorldModelEnv", policies: "Mapping[str, PreTrainedConfig]"
-) -> "Agreement":
+    cfg: EvalWorldModelConfig, imagination: WorldModelEnv, policies: Mapping[str, PreTrainedConfig]
+) -> Agreement:
     """Run every policy in the world model, which is made once, and in `real_env`."""
-    from lerobot_wmrl.common.policies import LoadedPolicy
-    from lerobot_wmrl.evaluation.agreement import Agreement
-    from lerobot_wmrl.evaluation.policy_rollouts import about_policy, evaluate_policy, opened, run_policy
-
     assert cfg.real_env is not None
     episodes, outcomes = cfg.policy_episodes, {}
     with opened(imagination, min(IMAGINED_AT_ONCE, episodes), False, 1) as (envs,):
@@ -348,16 +339,12 @@ def policy_agreement(
 
 def report_text_model(
     cfg: EvalWorldModelConfig,
-    text_model: "TextWorldModelRewardModel",
-    recording: "Recording",
-    evaluation: "ReplayEvaluation",
+    text_model: TextWorldModelRewardModel,
+    recording: Recording,
+    evaluation: ReplayEvaluation,
     longest: int,
-) -> "Report":
+) -> Report:
     """Report goal frames, and draw the reward along the shown episodes."""
-    from lerobot_wmrl.evaluation.pictures import save_reward_curves
-    from lerobot_wmrl.evaluation.report import report_goals
-    from lerobot_wmrl.evaluation.reward_curves import reward_along_episode
-
     curves = {
         name: reward_along_episode(
             text_model, cfg.reward, recording, replay,

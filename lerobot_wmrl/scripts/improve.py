@@ -15,28 +15,23 @@ where it stopped. It ends with a summary and `report.html`.
 """
 
 import shlex
-from typing import TYPE_CHECKING
 
 import draccus
 
+from lerobot_wmrl.common.checkpoints import checkpoint_digest, resolved_name
+from lerobot_wmrl.common.output_folders import Claim
+from lerobot_wmrl.common.stages import MARKER, Stage, run_stage_command, run_stages
+from lerobot_wmrl.data.dataset import fingerprint
+from lerobot_wmrl.improve import commands
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.plan import Plan
-
-if TYPE_CHECKING:
-    from lerobot_wmrl.common.stages import Stage
+from lerobot_wmrl.improve.progress import Progress
+from lerobot_wmrl.improve.report.page import Page
+from lerobot_wmrl.improve.report.words import verdict
 
 
 def improve(cfg: ImproveConfig) -> None:
     """Run every stage, write the report, and say what came of it."""
-    from lerobot_wmrl.common.checkpoints import checkpoint_digest
-    from lerobot_wmrl.common.output_folders import Claim
-    from lerobot_wmrl.common.stages import MARKER, run_stages
-    from lerobot_wmrl.data.dataset import fingerprint
-    from lerobot_wmrl.improve import commands
-    from lerobot_wmrl.improve.progress import Progress
-    from lerobot_wmrl.improve.report.page import Page
-    from lerobot_wmrl.improve.report.words import verdict
-
     cfg.validate()
     plan = Plan.of(cfg)
     print(f"{cfg.dataset.name}:\n{plan.findings}\n  {plan.duration}")
@@ -57,10 +52,8 @@ def improve(cfg: ImproveConfig) -> None:
         print(f"Another round, with as many rollouts of this policy:\n{shlex.join(again)}")
 
 
-def settings(cfg: ImproveConfig, stages: "list[Stage]") -> dict[str, object]:
+def settings(cfg: ImproveConfig, stages: list[Stage]) -> dict[str, object]:
     """Return what decides the result, as JSON."""
-    from lerobot_wmrl.common.checkpoints import resolved_name
-
     assert cfg.policy is not None
     settings = {name: value for name, value in draccus.encode(cfg).items() if name != "policy"}
     if cfg.policy_flags:
@@ -75,8 +68,6 @@ def settings(cfg: ImproveConfig, stages: "list[Stage]") -> dict[str, object]:
 
 def main() -> None:
     """Run the console command."""
-    from lerobot_wmrl.common.stages import run_stage_command
-
     run_stage_command(improve, ImproveConfig, list)
 
 

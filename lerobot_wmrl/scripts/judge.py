@@ -27,28 +27,48 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from math import ceil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import draccus
+from lerobot.configs import PreTrainedConfig
 from tqdm import tqdm
 
-from lerobot_wmrl.common.checkpoints import Checkpoint
+from lerobot_wmrl.common.checkpoints import Checkpoint, checkpoint_digest, resolved_name
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.constants import DONE_FRAMES, DONE_THRESHOLD
 from lerobot_wmrl.common.errors import FieldError, Stopped, renamed, require_at_least, require_probability
 from lerobot_wmrl.common.files import write_json, writing
 from lerobot_wmrl.common.output_folders import Claim
-from lerobot_wmrl.data.dataset import ChosenEpisodes
+from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.data.dataset import ChosenEpisodes, fingerprint
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.envs.content import content_of
+from lerobot_wmrl.evaluation.evidence import (
+    LabelledRollouts,
+    confusion_of,
+    learnt_from,
+    pooled_instructions,
+    read_references,
+    replayed_rollouts,
+    trained_inside,
+)
+from lerobot_wmrl.evaluation.judgement import (
+    JUDGEMENT_FILE,
+    LEAST_YOUDEN,
+    Judgement,
+    confusion_json,
+    confusion_sentence,
+)
+from lerobot_wmrl.evaluation.pictures import save_judgement
+from lerobot_wmrl.evaluation.policy_rollouts import (
+    Envs,
+    about_policy,
+    load_policies,
+    opened,
+    read_policies,
+    run_block,
+)
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
-
-if TYPE_CHECKING:
-    from lerobot.configs import PreTrainedConfig
-
-    from lerobot_wmrl.common.statistics import Proportion
-    from lerobot_wmrl.evaluation.evidence import LabelledRollouts
-    from lerobot_wmrl.evaluation.judgement import Judgement
-    from lerobot_wmrl.evaluation.policy_rollouts import Envs
 
 
 @dataclass
@@ -152,17 +172,6 @@ MAY_DIFFER = ("policies", "references", "coverage")
 
 def judge(cfg: JudgeConfig) -> None:
     """Replay the rollouts and imagine what is missing of the episodes; write the results."""
-    from lerobot_wmrl.common.checkpoints import checkpoint_digest, resolved_name
-    from lerobot_wmrl.evaluation.evidence import (
-        LabelledRollouts,
-        confusion_of,
-        pooled_instructions,
-        replayed_rollouts,
-        trained_inside,
-    )
-    from lerobot_wmrl.evaluation.judgement import LEAST_YOUDEN, Judgement, confusion_sentence
-    from lerobot_wmrl.evaluation.pictures import save_judgement
-
     cfg.validate()
     cfg.world_model.path = resolved_name(cfg.world_model.path)
     env = cfg.imagination()
@@ -195,10 +204,8 @@ def judge(cfg: JudgeConfig) -> None:
     )
 
 
-def warnings_of_learnt(rollouts: "LabelledRollouts", world_model: str) -> list[str]:
+def warnings_of_learnt(rollouts: LabelledRollouts, world_model: str) -> list[str]:
     """Return a warning if the world model has learnt from the rollouts."""
-    from lerobot_wmrl.evaluation.evidence import learnt_from
-
     if not (learnt := learnt_from(world_model, rollouts)):
         return []
     return [
@@ -210,15 +217,12 @@ def warnings_of_learnt(rollouts: "LabelledRollouts", world_model: str) -> list[s
 
 def read_both(
     cfg: JudgeConfig, env: WorldModelEnv
-) -> "tuple[dict[str, PreTrainedConfig], dict[str, Proportion]]":
+) -> tuple[dict[str, PreTrainedConfig], dict[str, Proportion]]:
     """Read the configurations of all policies, references first, and the real success of these, by name.
 
     Raises:
         FieldError: one of them cannot be read, or a policy to judge is a reference.
     """
-    from lerobot_wmrl.evaluation.evidence import read_references
-    from lerobot_wmrl.evaluation.policy_rollouts import read_policies
-
     known, judged = read_references(cfg.references), read_policies(cfg.policies, env)
     with renamed("policies", "references"):
         references = read_policies(list(known), env)
@@ -232,9 +236,6 @@ def read_both(
 
 def named_content(cfg: JudgeConfig, env: WorldModelEnv, rollouts: Path) -> dict[str, str]:
     """Return digests of the rollouts, and of what imagined episodes follow from beside the policy."""
-    from lerobot_wmrl.data.dataset import fingerprint
-    from lerobot_wmrl.envs.content import content_of
-
     with starts_as_typed(cfg):
         content = content_of(env)
     return content | {"rollouts": fingerprint(rollouts) if cfg.starts_given else content["dataset"]}
@@ -246,14 +247,12 @@ def starts_as_typed(cfg: JudgeConfig) -> AbstractContextManager[None]:
     return renamed("dataset", "starts") if cfg.starts_given else nullcontext()
 
 
-def remember(judgement: "Judgement", cfg: JudgeConfig, configs: Collection[str]) -> None:
+def remember(judgement: Judgement, cfg: JudgeConfig, configs: Collection[str]) -> None:
     """Take over what earlier calls have imagined, of the policies of this one and of others.
 
     Raises:
         ValueError: the rollouts, the world model or a policy are not what they were then.
     """
-    from lerobot_wmrl.evaluation.judgement import JUDGEMENT_FILE, confusion_json
-
     results = cfg.output_dir / JUDGEMENT_FILE
     if not results.is_file():
         return
@@ -276,15 +275,13 @@ def remember(judgement: "Judgement", cfg: JudgeConfig, configs: Collection[str])
 
 
 def imagine(
-    cfg: JudgeConfig, env: WorldModelEnv, judgement: "Judgement", configs: "Mapping[str, PreTrainedConfig]",
+    cfg: JudgeConfig, env: WorldModelEnv, judgement: Judgement, configs: Mapping[str, PreTrainedConfig],
     rollouts: int, claim: Claim,
 ) -> None:  # fmt: skip
     """Imagine the episodes of the policies that have none yet; write the results after every policy.
 
     rollouts: how many there are, and so how many starts, unless others are given.
     """
-    from lerobot_wmrl.evaluation.judgement import JUDGEMENT_FILE
-    from lerobot_wmrl.evaluation.policy_rollouts import about_policy, load_policies, opened, run_block
 
     def write() -> None:
         finished = configs.keys() == judgement.outcomes.keys()
@@ -318,7 +315,7 @@ def even_batch(episodes: int, most: int) -> int:
     return ceil(episodes / ceil(episodes / most))
 
 
-def starts_of_one_task(envs: "Envs", cfg: JudgeConfig) -> int:
+def starts_of_one_task(envs: Envs, cfg: JudgeConfig) -> int:
     """Return the number of starts. FieldError if they are of several tasks: one rate says little of these."""
     made = [env for tasks in envs.values() for env in tasks.values()]
     if len(made) > 1:

@@ -13,19 +13,23 @@ import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, REWARD
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.files import require_new, whole_folder, writing
 from lerobot_wmrl.common.lerobot_commands import edit_advice
 from lerobot_wmrl.common.presets import flag_as_typed
 from lerobot_wmrl.data.dataset import DatasetSource, save_episode
-from lerobot_wmrl.data.episodes import SUCCESS_COLUMNS
-
-if TYPE_CHECKING:
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot_wmrl.data.decoding import decode, row_parts, rows_of
+from lerobot_wmrl.data.embodiment import component_names
+from lerobot_wmrl.data.episodes import SUCCESS_COLUMNS, read_episodes
+from lerobot_wmrl.data.features import encoder_of
+from lerobot_wmrl.evaluation.accuracy import absolute_control
 
 AFTER: Final = "next."
 """How the names of columns begin that say what came after a frame's action."""
@@ -54,10 +58,6 @@ class ResampleConfig(RunConfig):
 
 def resample(cfg: ResampleConfig) -> None:
     """Write the copy and say what is in it."""
-    from lerobot_wmrl.common.files import writing
-    from lerobot_wmrl.data.episodes import read_episodes
-    from lerobot_wmrl.evaluation.accuracy import absolute_control
-
     dataset = cfg.dataset.open()
     table = read_episodes(dataset)
     summed = summed_components(cfg, dataset)
@@ -76,13 +76,8 @@ def resample(cfg: ResampleConfig) -> None:
     )
 
 
-def summed_components(cfg: ResampleConfig, dataset: "LeRobotDataset") -> np.ndarray:
+def summed_components(cfg: ResampleConfig, dataset: LeRobotDataset) -> np.ndarray:
     """Mark the components of the action that add up. FieldError for a setting that cannot be. (A,)"""
-    from lerobot.utils.constants import ACTION
-
-    from lerobot_wmrl.common.files import require_new
-    from lerobot_wmrl.data.embodiment import component_names
-
     require_at_least(cfg, 2, "every")
     if dataset.fps % cfg.every:
         raise FieldError(
@@ -114,13 +109,9 @@ def summed_components(cfg: ResampleConfig, dataset: "LeRobotDataset") -> np.ndar
     return np.isin(names, cfg.displacements)
 
 
-def write_resampled(dataset: "LeRobotDataset", cfg: ResampleConfig, summed: np.ndarray) -> None:
+def write_resampled(dataset: LeRobotDataset, cfg: ResampleConfig, summed: np.ndarray) -> None:
     """Copy the frames that are kept with LeRobot's own functions; the folder is whole or absent."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from tqdm import trange
-
-    from lerobot_wmrl.common.files import whole_folder
-    from lerobot_wmrl.data.features import encoder_of
 
     try:
         encoder = encoder_of(dataset.features)
@@ -143,8 +134,6 @@ def write_resampled(dataset: "LeRobotDataset", cfg: ResampleConfig, summed: np.n
 
 def scaled_features(features: Mapping[str, Any], summed: np.ndarray, every: int) -> dict[str, Any]:
     """Return a dataset's own features; the recorded range of components that add up grows with them."""
-    from lerobot.utils.constants import ACTION, DEFAULT_FEATURES
-
     columns = {name: dict(each) for name, each in features.items() if name not in DEFAULT_FEATURES}
     info = dict(columns[ACTION].get("info") or {})
     for end in {"low", "high"} & info.keys():
@@ -153,11 +142,9 @@ def scaled_features(features: Mapping[str, Any], summed: np.ndarray, every: int)
 
 
 def episode_rows(
-    dataset: "LeRobotDataset", episode: int, features: Mapping[str, Any], every: int, summed: np.ndarray
+    dataset: LeRobotDataset, episode: int, features: Mapping[str, Any], every: int, summed: np.ndarray
 ) -> Iterator[dict[str, Any]]:
     """Yield the rows of an episode's copy, as LeRobotDataset's `add_frame` takes them."""
-    from lerobot_wmrl.data.decoding import decode, row_parts, rows_of
-
     columns = kept_values(dataset, episode, features, every, summed)
     begin = rows_of(dataset, episode).start
     for part in row_parts(dataset, episode):  # the frames of a long episode would not fit into the memory
@@ -169,13 +156,9 @@ def episode_rows(
 
 
 def kept_values(
-    dataset: "LeRobotDataset", episode: int, features: Mapping[str, Any], every: int, summed: np.ndarray
+    dataset: LeRobotDataset, episode: int, features: Mapping[str, Any], every: int, summed: np.ndarray
 ) -> dict[str, Any]:
     """Return an episode's columns but for its pictures, and `task`, at the T rows that are kept. (T, …)"""
-    from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, REWARD
-
-    from lerobot_wmrl.data.decoding import rows_of
-
     rows = rows_of(dataset, episode)
     length = rows.stop - rows.start
     kept = np.arange(0, length, every)

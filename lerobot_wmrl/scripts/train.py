@@ -17,16 +17,22 @@ Running the same command again continues from the last checkpoint. `--preset=dem
 `lerobot-eval --policy.path=outputs/rl/checkpoints/best/pretrained_model …` evaluates the result.
 """
 
-from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
 import draccus
+from accelerate import PartialState
 from lerobot.configs.policies import PreTrainedConfig
+from lerobot.utils.random_utils import set_seed
 
+from lerobot_wmrl.common.checkpoints import (
+    checkpoint_digest,
+    link_latest,
+    newest_checkpoint,
+    require_resumable,
+)
 from lerobot_wmrl.common.command_line import run_command
-from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.distributed import (
     LONGEST_WAIT,
     is_first_process,
@@ -36,30 +42,33 @@ from lerobot_wmrl.common.distributed import (
 )
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.output_folders import Claim
-from lerobot_wmrl.common.policies import LoadedPolicy
+from lerobot_wmrl.common.pipeline import make_pipeline, unchanged
+from lerobot_wmrl.common.policies import LoadedPolicy, with_new_adapters
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.common.tracking import make_wandb
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.envs.content import content_of
+from lerobot_wmrl.envs.lerobot_env import make_tensor_env
 from lerobot_wmrl.envs.tensor_env import TensorEnv
-from lerobot_wmrl.rl.configuration_train import MAY_DIFFER, TrainConfig, load_config
+from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
+from lerobot_wmrl.rl.budget import charge_steps, check_data
+from lerobot_wmrl.rl.callbacks import has_record
+from lerobot_wmrl.rl.compatibility import match_policy_to_env, rollout_length, settle_discount
+from lerobot_wmrl.rl.configuration_train import MAY_DIFFER, TrainConfig, resolve_policy
+from lerobot_wmrl.rl.make_callbacks import make_callbacks
+from lerobot_wmrl.rl.rollout import RolloutBuffer
+from lerobot_wmrl.rl.selection import Selection
 from lerobot_wmrl.rl.trained_policy import publish, summary
+from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 
 
 def train_policy(cfg: TrainConfig) -> None:
     """Load the policy, build the environment, train, publish, and say what was made."""
-    from accelerate import PartialState
-    from lerobot.utils.random_utils import set_seed
-
-    from lerobot_wmrl.common.checkpoints import link_latest
-    from lerobot_wmrl.envs.lerobot_env import make_tensor_env
-    from lerobot_wmrl.rl.budget import check_data
-    from lerobot_wmrl.rl.compatibility import settle_discount
-
     cfg.validate()
     settle_discount(cfg)
     check_data(cfg, cfg.env)
-    config = load_config(cfg)
+    config = resolve_policy(cfg)
     if isinstance(cfg.env, WorldModelEnv) and cfg.env.device not in (None, config.device):
         raise FieldError(
             "env.device", cfg.env.device, f"the policy is on {config.device}, and the world model too",
@@ -93,9 +102,6 @@ def train_policy(cfg: TrainConfig) -> None:
 
 def named_content(cfg: TrainConfig, policy: PreTrainedConfig) -> dict[str, str]:
     """Return digests of the policy that is trained, and of what imagined episodes follow from."""
-    from lerobot_wmrl.common.checkpoints import checkpoint_digest
-    from lerobot_wmrl.envs.content import content_of
-
     path = policy.pretrained_path
     trained = {"policy": checkpoint_digest(path)} if path else {}
     with within("env"):
@@ -104,10 +110,6 @@ def named_content(cfg: TrainConfig, policy: PreTrainedConfig) -> dict[str, str]:
 
 def finished(cfg: TrainConfig) -> bool:
     """Return whether the run has reached its last iteration. FieldError if there is nothing to resume."""
-    from lerobot_wmrl.common.checkpoints import newest_checkpoint, require_resumable
-    from lerobot_wmrl.rl.callbacks import has_record
-    from lerobot_wmrl.rl.selection import Selection
-
     last = newest_checkpoint(cfg.output_dir)
     if cfg.resume:
         require_resumable(cfg.output_dir)
@@ -120,24 +122,15 @@ def finished(cfg: TrainConfig) -> bool:
 
 def train_in(env: TensorEnv, cfg: TrainConfig, claim: Claim, policy: LoadedPolicy) -> None:
     """Check that policy and environment fit, then train in the output folder of the claim."""
-    from lerobot_wmrl.common.pipeline import make_pipeline
-    from lerobot_wmrl.common.policies import with_new_adapters
-    from lerobot_wmrl.rl.budget import charge_steps
-    from lerobot_wmrl.rl.compatibility import match_policy_to_env, rollout_length
-    from lerobot_wmrl.rl.distillation import Distillation
-    from lerobot_wmrl.rl.make_callbacks import make_callbacks
-    from lerobot_wmrl.rl.rollout import RolloutBuffer
-    from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
-
     config = policy.config
     match_policy_to_env(cfg, policy, env)
     if cfg.peft is not None:
         policy.policy = with_new_adapters(policy.policy, cfg.peft)
     algorithm = make_algorithm(policy.policy, cfg.algorithm, cfg.output_dir)
     reseed_other_ranks(cfg.seed)  # of which the distilled policy's loss draws some
-    pipeline = make_pipeline(config, *policy.processors, shown=compacted(env))
-    if isinstance(algorithm, Distillation):
-        algorithm.check_recorded(env, pipeline)
+    shown = env.store_compact() if isinstance(env, WorldModelVectorEnv) else unchanged
+    pipeline = make_pipeline(config, *policy.processors, shown=shown)
+    algorithm.check_dataset(env, pipeline)
     longest = env.max_episode_steps
     buffer = RolloutBuffer(rollout_length(cfg, longest), cfg.num_envs, config.device, longest)
     callbacks = make_callbacks(cfg, policy, env)
@@ -158,21 +151,8 @@ def train_in(env: TensorEnv, cfg: TrainConfig, claim: Claim, policy: LoadedPolic
         )  # fmt: skip
 
 
-def compacted(env: TensorEnv) -> Callable[[Observation], Observation]:
-    """Let imagined frames stay as small as they are imagined, and return what makes them a policy's."""
-    from lerobot_wmrl.common.pipeline import unchanged
-    from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
-
-    if not isinstance(env, WorldModelVectorEnv):
-        return unchanged
-    env.compact = True
-    return lambda observation: env.model.shown(observation)  # of the model that Dyna may have refreshed
-
-
 def main() -> None:
     """Entry point of the console command."""
-    from accelerate import PartialState
-
     keep_freed_memory()
     run_command(train_policy, TrainConfig, partial(expand_preset, command="train"))
     PartialState().destroy_process_group()

@@ -23,7 +23,9 @@ import draccus
 from accelerate import PartialState
 from lerobot.configs.default import WandBConfig
 from lerobot.configs.rewards import RewardModelConfig
+from lerobot.utils.random_utils import set_seed
 
+from lerobot_wmrl.common.checkpoints import link_latest, model_folder, newest_checkpoint, require_resumable
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process, process_seed
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_choice, within
@@ -31,10 +33,16 @@ from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.output_folders import RUN_CONFIG_FILE, Claim
 from lerobot_wmrl.common.precision import PRECISIONS, keep_freed_memory, training_dtype
 from lerobot_wmrl.common.presets import expand_preset, format_flags
-from lerobot_wmrl.common.tracking import make_wandb
+from lerobot_wmrl.common.tracking import make_wandb, read_metrics
 from lerobot_wmrl.data.dataset import TrainingData, fingerprint
-from lerobot_wmrl.data.episodes import EpisodeTable
+from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
+from lerobot_wmrl.data.ledger import Ledger
+from lerobot_wmrl.evaluation.reconstruction import write_reconstruction
+from lerobot_wmrl.maniskill.recordings import require_unreported
+from lerobot_wmrl.world_models.checkpoint import config_to_continue
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+from lerobot_wmrl.world_models.training import build_model, held_out_metrics, train
+from lerobot_wmrl.world_models.training_data import decide_on_instructions, make_joint_sampler
 
 TRAINED = ("frame_tokenizer", "action_world_model", "text_world_model")
 
@@ -128,8 +136,6 @@ def check_data(cfg: TrainWorldModelConfig, table: EpisodeTable) -> None:
 
     These are episodes on which results are reported, and, with a budget, those that are not in its ledger.
     """
-    from lerobot_wmrl.data.ledger import Ledger
-    from lerobot_wmrl.maniskill.recordings import require_unreported
 
     def check_table(table: EpisodeTable, chosen: list[int] | None) -> None:
         learnt = table.training(chosen).nonzero()[0]
@@ -145,14 +151,6 @@ def check_data(cfg: TrainWorldModelConfig, table: EpisodeTable) -> None:
 
 def train_world_model(cfg: TrainWorldModelConfig) -> None:
     """Build or reload the model, train it, measure it on held-out episodes, publish it."""
-    from lerobot.utils.random_utils import set_seed
-
-    from lerobot_wmrl.common.checkpoints import link_latest, newest_checkpoint, require_resumable
-    from lerobot_wmrl.data.episodes import read_episodes
-    from lerobot_wmrl.world_models.checkpoint import config_to_continue
-    from lerobot_wmrl.world_models.training import build_model
-    from lerobot_wmrl.world_models.training_data import decide_on_instructions
-
     path, settings = cfg.given["model"]
     if path:
         cfg.model = config_to_continue(path, settings)
@@ -205,9 +203,6 @@ def run_training(
     cfg: TrainWorldModelConfig, claim: Claim, model: Any, table: EpisodeTable, processes: PartialState
 ) -> None:
     """Cache the data, in the first process before the others, and train."""
-    from lerobot_wmrl.world_models.training import train
-    from lerobot_wmrl.world_models.training_data import make_joint_sampler
-
     with ExitStack() as held:
         with processes.main_process_first():
             sampler = make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, process_seed(cfg.seed))
@@ -218,8 +213,6 @@ def run_training(
 
 def conclusion(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> str:
     """Measure the trained model and say what was made, how good it is and what comes next."""
-    from lerobot_wmrl.common.checkpoints import model_folder
-
     size = sum(path.stat().st_size for path in model_folder(cfg.output_dir).glob("*.safetensors"))
     parameters = sum(parameter.numel() for parameter in model.parameters())
     made = f"{parameters:,} parameters, {size / 1e6:.1f} MB"
@@ -231,10 +224,6 @@ def conclusion(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> s
 
 def quality(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> str:
     """Say how good the model is on episodes that are held out, or in training if none is."""
-    from lerobot_wmrl.common.tracking import read_metrics
-    from lerobot_wmrl.evaluation.reconstruction import write_reconstruction
-    from lerobot_wmrl.world_models.training import held_out_metrics
-
     if isinstance(cfg.model, FrameTokenizerConfig):
         measured = write_reconstruction(model, table, cfg.output_dir, cfg.dataset.episodes)
         psnr = ", ".join(f"{camera} {value:.1f} dB" for camera, value in measured["psnr"].items())

@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal, overload
 
 import torch
 from draccus.utils import ParsingError
@@ -26,6 +26,13 @@ from lerobot_wmrl.data.embodiment import check_same_robot
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, WorldModelConfig
 
+if TYPE_CHECKING:
+    from lerobot_wmrl.world_models.modeling_frame_tokenizer import FrameTokenizerRewardModel
+    from lerobot_wmrl.world_models.modeling_world_model import (
+        ActionWorldModelRewardModel,
+        TextWorldModelRewardModel,
+    )
+
 FIELDS: Final = {
     "frame_tokenizer": "tokenizer_path",
     "action_world_model": "world_model_path",
@@ -34,6 +41,17 @@ FIELDS: Final = {
 """Field that holds the path of a model of each type, where the caller does not say."""
 
 
+@overload
+def read_config(
+    path: str | Path,
+    expected_type: Literal["action_world_model"],
+    device: str | None = "cpu",
+    field: str | None = None,
+) -> ActionWorldModelConfig: ...
+@overload
+def read_config(
+    path: str | Path, expected_type: str, device: str | None = "cpu", field: str | None = None
+) -> RewardModelConfig: ...
 def read_config(
     path: str | Path, expected_type: str, device: str | None = "cpu", field: str | None = None
 ) -> RewardModelConfig:
@@ -150,6 +168,31 @@ def _stored_type(path: Path) -> Any:
         ) from error
 
 
+@overload
+def load_model(
+    path: str | Path,
+    expected_type: Literal["frame_tokenizer"],
+    device: str | None = "cpu",
+    field: str | None = None,
+) -> "FrameTokenizerRewardModel": ...
+@overload
+def load_model(
+    path: str | Path,
+    expected_type: Literal["action_world_model"],
+    device: str | None = "cpu",
+    field: str | None = None,
+) -> "ActionWorldModelRewardModel": ...
+@overload
+def load_model(
+    path: str | Path,
+    expected_type: Literal["text_world_model"],
+    device: str | None = "cpu",
+    field: str | None = None,
+) -> "TextWorldModelRewardModel": ...
+@overload
+def load_model(
+    path: str | Path, expected_type: str, device: str | None = "cpu", field: str | None = None
+) -> Any: ...
 def load_model(
     path: str | Path, expected_type: str, device: str | None = "cpu", field: str | None = None
 ) -> Any:

@@ -23,17 +23,14 @@ class Goal(NamedTuple):
 
 
 @torch.no_grad()
-def imagine_goal(
-    model: ImaginationMixin, frames: Frames, instructions: Sequence[str],
-    threshold: float = GOAL_THRESHOLD,
-) -> Goal:  # fmt: skip
-    """Imagine the goal frame (eq. 6): the first whose done probability reaches θ, else the likeliest.
+def imagine_goal(model: ImaginationMixin, frames: Frames, instructions: Sequence[str]) -> Goal:
+    """Imagine the goal frame (eq. 6): the first whose done probability reaches θ (`GOAL_THRESHOLD`), else the
+    likeliest.
 
     Args:
         model: a text world model; imagines `goal_horizon` frames at most.
         frames: where the imaginations begin.
         instructions: one for each.
-        threshold: θ.
     """
     imagination, tokens = model.start(frames, instructions), frames.tokens
     goal, best = tokens, torch.full((tokens.shape[0],), -1.0, device=tokens.device)
@@ -44,7 +41,7 @@ def imagine_goal(
         better = (probability > best) & ~reached
         goal = torch.where(better[:, None], imagined.tokens, goal)
         best = torch.where(better, probability, best)
-        reached = reached | (probability >= threshold)
+        reached = reached | (probability >= GOAL_THRESHOLD)
         if bool(reached.all()):
             break
     return Goal(goal, model.tokenizer.decode_with_features(goal, frames.context), reached)

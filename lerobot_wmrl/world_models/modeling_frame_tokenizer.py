@@ -27,7 +27,11 @@ COLLAPSE_BEGINS: Final = 0.1
 """Share of the training from which the tokens of different frames must differ."""
 
 COLLAPSE_BATCH: Final = 8
-"""Frames of a batch that can be told to be all alike not by chance."""
+"""Frames that a batch must have for its tokens to be compared."""
+
+COLLAPSE_STEPS: Final = 20
+"""Batches in a row whose frames all have the same tokens that tell of a collapse. In a single one, all frames
+may be of a robot that waits."""
 
 
 def stack_cameras(batch: dict[str, Tensor], keys: Sequence[str], size: int) -> Tensor:
@@ -97,6 +101,7 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         if dataset_meta is not None and config.perceptual_weight:
             require_backbone("vgg", "perceptual_weight", config.perceptual_weight, "0")
         self.tokenizer = FrameTokenizer(config.tokenizer)
+        self._alike = 0  # batches in a row, up to the last, whose frames all had the same tokens
 
     def forward(self, batch: dict[str, Any], progress: float = 1.0) -> tuple[Tensor, dict[str, float]]:
         """Return the reconstruction loss of `observation.images.*` (B, 3, H, W) and metrics.
@@ -107,7 +112,8 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         The loss is the same at any `progress` of the training.
 
         Raises:
-            ValueError: a tenth of the training is done, and all frames of the batch have the same tokens.
+            ValueError: a tenth of the training is done, and in each of the last `COLLAPSE_STEPS` batches all
+                frames had the same tokens.
         """
         images, reference = self._observed(batch), self._reference(batch)
         weight, context = None, NO_CONTEXT
@@ -126,11 +132,12 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         return loss + CLASSIFIER_LOSS_WEIGHT * success_loss, metrics | success_metrics
 
     def _require_distinct(self, distinct: float) -> None:
-        if round(distinct) <= 1:
+        self._alike = self._alike + 1 if round(distinct) <= 1 else 0
+        if self._alike >= COLLAPSE_STEPS:
             raise ValueError(
-                "distinct_frames: all frames of a batch have the same tokens, from which nothing can be "
-                f"learnt; look at the frames of {self.config.tokenizer.camera_keys}, which may be alike, or "
-                f"lower `model.learning_rate` (now {self.config.learning_rate})"
+                f"distinct_frames: in {self._alike} batches in a row all frames have the same tokens, from "
+                f"which nothing can be learnt; look at the frames of {self.config.tokenizer.camera_keys}, "
+                f"which may be alike, or lower `model.learning_rate` (now {self.config.learning_rate})"
             )
 
     def _observed(self, batch: dict[str, Tensor]) -> Tensor:

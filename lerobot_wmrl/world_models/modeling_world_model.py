@@ -47,7 +47,7 @@ from lerobot_wmrl.world_models.modeling_frame_tokenizer import (
     stretch_cameras,
     with_frame_sizes,
 )
-from lerobot_wmrl.world_models.scaling import REACH, STATE_MIN_STD, Scale
+from lerobot_wmrl.world_models.scaling import STATE_MIN_STD, Scale
 from lerobot_wmrl.world_models.text import CHECKPOINT_FOLDER, FrozenT5, check_one_each, make_text_encoder
 
 CONDITION_TOKENS: Final = 4
@@ -122,11 +122,6 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         if meta is None or self.config.pretrained_path or not self.config.state_size:
             return None
         return read_vectors(Path(meta.root), OBS_STATE) if parquet_files(Path(meta.root)) else None
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Read checkpoints of versions that clamped every component at `REACH` as well."""
-        state_dict.setdefault(f"{prefix}state_limit", torch.full_like(self.state_std, REACH))
-        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def train(self, mode: bool = True) -> "WorldModelRewardModel":
         """Keep the tokenizer, which is fixed, in evaluation mode."""

@@ -47,6 +47,7 @@ def decide_on_instructions(config: RewardModelConfig, table: EpisodeTable, data:
     tables = [table.subset(table.training(data.episodes))]
     tables += [each.subset(each.training(None)) for each in data.read_more()]
     reads = count_tasks(tables) > 1 if asked is None else asked
+    tables.append(table.subset(table.among(data.episodes)))  # those that are held out will be read too
     problem = reads and instruction_problem(text for each in tables for text in each.instructions)
     if problem and asked:
         raise FieldError(
@@ -104,8 +105,12 @@ def make_sampler(
         )  # fmt: skip
     config: Any = model.config
     frames = cached_frames(table.dataset, config.tokenizer.camera_keys, config.tokenizer.image_size)
-    # held-out episodes are measured after hours of training: what cannot be decoded says so now
-    frames.fill(table.row_numbers(table.among(chosen).nonzero()[0]))
+    measured = table.among(chosen)  # also after hours of training: what cannot be read says so now
+    if isinstance(config, TextWorldModelConfig):
+        golden = golden_episodes(table)
+        episodes, measured = require_golden(table, episodes & golden), measured & golden
+    measured = measured.nonzero()[0]
+    frames.fill(table.row_numbers(measured))
     if model.name == "frame_tokenizer":
         if config.tokenizer.success and not table.has_labels:
             raise FieldError(
@@ -118,9 +123,11 @@ def make_sampler(
         return FrameSampler(
             table, frames, episodes.nonzero()[0], config.tokenizer.cameras, batch_size, seed, config.device
         )
-    if isinstance(config, TextWorldModelConfig):
-        episodes = require_golden(table, episodes & golden_episodes(table))
-    elif not table.has_labels:
+    require_readable_instructions(model, table.subset(measured))
+    if config.depth:
+        depth = cached_depth(table.dataset, config.tokenizer.camera_keys, model.tokenizer.grid)
+        depth.fill(table.row_numbers(measured))
+    if not isinstance(config, TextWorldModelConfig) and not table.has_labels:
         logging.warning(
             "dataset.root=%s: has neither next.success nor next.done: the model cannot learn from it what "
             "success is. Check it afterwards (lerobot-wmrl-eval-world-model)",
@@ -129,18 +136,31 @@ def make_sampler(
     return make_clip_sampler(model, table, episodes.nonzero()[0], batch_size, seed)
 
 
+def require_readable_instructions(model: Any, table: EpisodeTable) -> None:
+    """Raise FieldError if a world model reads the instructions of episodes, and cannot read one of them."""
+    problem, remedy = "", "leave it out, or record other instructions"
+    if isinstance(model.config, TextWorldModelConfig):
+        try:
+            model.text_encoder.check(table.instructions)
+        except ValueError as error:
+            problem = str(error)
+    elif model.config.reads_instructions:
+        problem = instruction_problem(table.instructions)
+        remedy = "or train a tokenizer with `tokenizer.instructions`=false, and the world model on it"
+    if problem:
+        raise FieldError("dataset.root", table.dataset.root, problem, remedy)
+
+
 def make_clip_sampler(
     model: Any, table: EpisodeTable, episodes: np.ndarray, batch_size: int, seed: int
 ) -> ClipSampler:
     """Make a sampler of clips from these episodes, with what else the model looks at or predicts."""
     config, tokenizer, dataset = model.config, model.tokenizer, table.dataset
-    chosen = table.subset(episodes)
-    if config.reads_instructions and (problem := instruction_problem(chosen.instructions)):
-        raise FieldError(
-            "dataset.root", dataset.root, problem,
-            "or train a tokenizer with `tokenizer.instructions`=false, and the world model on it",
-        )  # fmt: skip
-    if config.predicts_success and not config.reads_instructions and count_tasks([chosen]) > 1:
+    if (
+        config.predicts_success
+        and not config.reads_instructions
+        and count_tasks([table.subset(episodes)]) > 1
+    ):
         logging.warning(
             "%s: has several tasks, and success is told without the instruction: what one task asks for "
             "counts in another too. A tokenizer with --model.tokenizer.instructions=true reads it",
@@ -191,25 +211,12 @@ def make_joint_sampler(
     with renamed("dataset.root", "dataset.more"):
         for other in more:
             check_dataset(model.config, other.dataset.meta)
-            check_instructions(model, other)
     if isinstance(model.config, ActionWorldModelConfig):
         note_outcomes(model.config, [(table, data.episodes), *((each, None) for each in more)])
     first = make_sampler(model, table, data.episodes, batch_size, seed)
     with renamed("dataset.root", "dataset.more"):
         samplers = [make_sampler(model, each, None, batch_size, seed) for each in more]
     return InTurn(first, samplers) if samplers else first
-
-
-def check_instructions(model: Any, table: EpisodeTable) -> None:
-    """Raise FieldError if a text world model cannot read an instruction of a dataset."""
-    if not isinstance(model.config, TextWorldModelConfig):
-        return
-    try:
-        model.text_encoder.check(table.dataset.meta.tasks.index)
-    except ValueError as error:
-        raise FieldError(
-            "dataset.root", table.dataset.root, str(error), "leave it out, or record other instructions"
-        ) from error
 
 
 def note_outcomes(

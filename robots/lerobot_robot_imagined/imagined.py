@@ -41,7 +41,7 @@ class ImaginedRobot(Robot):
     def __init__(self, config: ImaginedRobotConfig) -> None:
         super().__init__(config)
         self.config = config
-        self.model: Any = read_config(config.world_model_path, "action_world_model")
+        self.model = read_config(config.world_model_path, "action_world_model")
         self.env: Any = None
         self.keys: EpisodeKeys | None = None
         self.succeeded = False
@@ -50,7 +50,7 @@ class ImaginedRobot(Robot):
     @property
     def cameras(self) -> dict[str, tuple[int, int, int]]:
         """Image shapes (H, W, 3) by camera."""
-        tokenizer = self.model.tokenizer
+        tokenizer = self.model.trained_tokenizer
         shapes = zip(tokenizer.cameras, tokenizer.frame_shapes.values(), strict=True)
         return {camera.rpartition(".")[2]: (height, width, 3) for camera, (_, height, width) in shapes}
 
@@ -112,7 +112,7 @@ class ImaginedRobot(Robot):
             self._begin()
         self.began = self.began or time.perf_counter()
         state = self.observation[OBS_STATE][0].tolist() if OBS_STATE in self.observation else []
-        images = (to_pixels(self.observation[key][0]) for key in self.model.tokenizer.camera_keys)
+        images = (to_pixels(self.observation[key][0]) for key in self.model.trained_tokenizer.camera_keys)
         return dict(zip(self.observation_features, [*state, *images], strict=True))
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:

@@ -23,7 +23,7 @@ UNDOCUMENTED = {
         "DEPTH_METER_UNIT", "DepthEncoderConfig", "RGBEncoderConfig", "infer_depth_unit",
     },
     "lerobot.datasets.aggregate": {"aggregate_datasets"},
-    "lerobot.datasets.dataset_metadata": {"CODEBASE_VERSION"},
+    "lerobot.datasets.dataset_metadata": {"CODEBASE_VERSION", "LeRobotDatasetMetadata"},
     "lerobot.datasets.dataset_tools": {"add_features", "remove_feature"},
     "lerobot.datasets.depth_utils": {"MM_PER_METRE", "dequantize_depth"},
     "lerobot.datasets.factory": {"resolve_delta_timestamps"},

@@ -14,9 +14,9 @@ import pytest
 from lerobot.configs import parser
 
 from lerobot_wmrl.common import stages as runner
-from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.lerobot_commands import edit_command, train_command
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.common.stages import (
     Stage,
     StageError,

@@ -14,6 +14,7 @@ from lerobot_wmrl.data import frame_cache
 from lerobot_wmrl.data.dataset import ChosenEpisodes, DatasetSource, TrainingData, open_dataset
 from lerobot_wmrl.data.decoding import decode, rows_of
 from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.evaluation.evidence import learnt_digests
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from tests.hub_server import Hub
 from tests.trained import tokenizer_config
@@ -104,6 +105,7 @@ def test_of_chosen_episodes_alone_videos_are_downloaded(
     assert len(open_dataset(dataset.root, episodes=[3])) == len(in_many_files)
     source.open()
     assert not [path for _, path in hub.requests if "resolve" in path], "they are there"
+    assert len(learnt_digests(Path(dataset.root), [1, 3])) == 2, "a world model's rollouts are recognised"
     with pytest.raises(ValueError, match=r"2 files are missing, the first is videos/.*file-000\.mp4"):
         open_dataset(dataset.root)
     assert len(list(Path(DatasetSource(root, NAME).open().root).glob("videos/**/*.mp4"))) == 4

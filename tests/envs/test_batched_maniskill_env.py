@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.envs.batched_maniskill_env import BatchedManiSkillEnv
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter

@@ -9,7 +9,7 @@ import torch
 from lerobot.envs import close_envs
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
 
-from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.maniskill_env import ManiSkillEnv, ManiSkillTensorEnv
 from lerobot_wmrl.maniskill.episode import Frame

@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 
-from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.maniskill_env import make_vector_env
 from lerobot_wmrl.envs.scene_results import SceneResults

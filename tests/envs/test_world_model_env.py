@@ -10,6 +10,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
+from lerobot_wmrl.common.pipeline import unchanged
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
@@ -300,11 +301,11 @@ def test_compact_frames_become_those_that_a_policy_sees(config):
     for compact in (False, True):
         env = config.create_tensor_env(B)
         env.model.config.tokenizer = replace(env.model.config.tokenizer, frame_sizes=[[48, 80]])
-        env.compact = compact
+        shown = env.store_compact() if compact else unchanged
         first, _ = env.reset(seed=0)
         later = env.step(torch.zeros(B, 7))[0]
         assert {each[IMAGE].shape[1:] for each in (first, later)} == {(3, 32, 32) if compact else (3, 48, 80)}
-        seen.append([env.model.shown(each) for each in (first, later)])
+        seen.append([shown(each) for each in (first, later)])
         assert make_success_env(env, env.starts).reset(seed=0)[0][IMAGE].shape == (B, 3, 48, 80)
     for full, stored in zip(*seen, strict=True):
         assert full.keys() == stored.keys()

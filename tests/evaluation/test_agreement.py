@@ -11,7 +11,7 @@ import torch
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.checkpoints import Checkpoint, model_folder
-from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.episodes import read_episodes

@@ -25,7 +25,7 @@ from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
 from lerobot_wmrl.common.checkpoints import link_checkpoint, resolved_name
-from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -56,6 +58,8 @@ def test_a_final_frame_is_the_first_in_which_success_holds(small_dataset, text_m
     assert episodes.tolist() == source.table.success.nonzero()[0].tolist()
     assert source.table.done[rows - 1].all()
     assert not source.table.done[rows - 2].any()
+    chosen = np.arange(6) < 2
+    assert final_rows(replace(source, chosen=chosen))[0].tolist() == [0, 1], "of others no video may be here"
 
 
 def test_goals_are_compared_with_real_successes(small_dataset, text_model):

@@ -363,6 +363,16 @@ def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
     write(copy / "train_config.json", {"dataset": {"root": config.dataset.root, "episodes": [0, 1]}})
     assert learnt_from(str(copy), LabelledRollouts.read(config.dataset, episodes=[2, 3])) == 0
     assert learnt_from(str(copy), LabelledRollouts.read(config.dataset, episodes=[1, 2])) == 1
+    write(copy / "train_config.json", {
+        "dataset": {"root": config.dataset.root, "episodes": [0, 1], "more": [again.root]}
+    })  # fmt: skip
+    assert learnt_from(str(copy), LabelledRollouts.read(config.dataset)) == 6, "as copies too"
+    write(tmp_path / "tokenizer" / "train_config.json", {"dataset": {"root": config.dataset.root}})
+    of_others = {"dataset": {"root": others.root}, "model": {"tokenizer_path": str(tmp_path / "tokenizer")}}
+    write(copy / "train_config.json", of_others)
+    for tells_success, expected in ((False, 0), (True, 6)):
+        write(tmp_path / "tokenizer" / "config.json", {"tokenizer": {"success": tells_success}})
+        assert learnt_from(str(copy), LabelledRollouts.read(config.dataset)) == expected
     copy = tmp_path / "of_the_hub"
     shutil.copytree(model_folder(config.world_model.path), copy)
     write(copy / "train_config.json", {"dataset": {"repo_id": "user/rollouts"}})

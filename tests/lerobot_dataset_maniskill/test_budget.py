@@ -11,9 +11,9 @@ from lerobot_dataset_maniskill import maniskill
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.record import run
 from lerobot_dataset_maniskill.recorder import record
-from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import read_policy_config
+from lerobot_wmrl.common.seeds import EVALUATION_SEED, GATE_SEED
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.ledger import Ledger, Limits

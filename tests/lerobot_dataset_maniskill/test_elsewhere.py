@@ -21,10 +21,11 @@ from lerobot_dataset_maniskill.elsewhere import Rollouts
 from lerobot_dataset_maniskill.merging import merge_folders
 from lerobot_dataset_maniskill.recorder import record
 from lerobot_wmrl.common.command_line import GivenPath
-from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED, START_SEED
+from lerobot_wmrl.common.constants import START_SEED
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.images import to_pixels
 from lerobot_wmrl.common.policies import read_policy_config
+from lerobot_wmrl.common.seeds import EVALUATION_SEED, GATE_SEED
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.features import matched, row_in

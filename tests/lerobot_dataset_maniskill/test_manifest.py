@@ -7,7 +7,7 @@ import pytest
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import planned_kinds, planned_parts
-from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
 

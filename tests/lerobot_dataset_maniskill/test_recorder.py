@@ -18,10 +18,10 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import planned_parts
 from lerobot_dataset_maniskill.maniskill import follow_workers
-from lerobot_dataset_maniskill.merging import require_same_recording
 from lerobot_dataset_maniskill.recorder import missing_parts, record
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, find_damage
 from lerobot_wmrl.common.constants import KINDS, START_KIND
+from lerobot_wmrl.common.output_folders import require_same
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
@@ -142,11 +142,7 @@ def test_other_settings_and_foreign_folders_are_refused(recorded: Path, tmp_path
         record(config(recorded, seed=5))
     stored, other = (config(recorded, video=video).recorded_content() for video in (True, False))
     with pytest.raises(ValueError, match=r"other settings \(video True → False\)"):
-        require_same_recording(stored, other, tmp_path)
-    del stored["video"]  # as earlier versions wrote it
-    require_same_recording(stored, config(recorded, video=True).recorded_content(), tmp_path)
-    with pytest.raises(ValueError, match=r"other settings \(video True → False\)"):
-        require_same_recording(stored, other, tmp_path)
+        require_same(tmp_path, stored, other)
     (tmp_path / "dataset").mkdir()
     (tmp_path / "dataset" / "thesis.txt").write_text("do not lose")
     with pytest.raises(ValueError, match="holds something else"):

@@ -10,7 +10,7 @@ from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 
 def update(algorithm: PolicyGradient, buffer: RolloutBuffer, pipeline: Pipeline) -> TrainingStats:
     """Update on a filled buffer, as the trainer does; all metrics are in `extra`."""
-    minibatches, metrics = algorithm.prepare(buffer, pipeline)
+    minibatches, metrics = algorithm.make_minibatches(buffer, pipeline)
     stats = algorithm.update(iter(minibatches))
     stats.extra = {**metrics, **stats.extra}
     return stats

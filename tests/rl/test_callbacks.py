@@ -12,17 +12,23 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.processor import PolicyProcessorPipeline
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
-from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED, SELECTION_SEED
 from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.common.policies import LoadedPolicy
+from lerobot_wmrl.common.seeds import (
+    DYNA_SEEDS,
+    EVALUATION_SEED,
+    GATE_SEED,
+    GATE_SEEDS,
+    SELECTION_SEED,
+    dyna_seed,
+    gate_seed,
+)
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.evaluation.policy_rollouts import evaluate_within
-from lerobot_wmrl.rl import gate
 from lerobot_wmrl.rl.callbacks import Callback, Record
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
-from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.seeds import first_seed
@@ -230,8 +236,12 @@ def test_selection_gate_and_dyna_have_seeds_of_their_own() -> None:
     """Each from its first number to the next: training < Dyna's last < evaluation < selection < gate."""
     training = {first_seed(seed, i, 64) + 63 for seed in (0, 999_999) for i in (0, 9, 15_000, 15_624)}
     assert max(training) < EVALUATION_SEED
-    assert EVALUATION_SEED > DYNA_SEEDS
     assert EVALUATION_SEED < SELECTION_SEED < GATE_SEED
-    firsts = [gate.first_rollout_seed(iteration, 50) for iteration in (0, 1, 40_000)]
-    assert all(GATE_SEED <= first < GATE_SEED + gate.SEEDS - 50 for first in firsts)
-    assert firsts[1] - firsts[0] == 50
+    places = (0, 50, 2_000_000)
+    for first_of, first, end in (
+        (dyna_seed, EVALUATION_SEED - DYNA_SEEDS, EVALUATION_SEED),
+        (gate_seed, GATE_SEED, GATE_SEED + GATE_SEEDS),
+    ):
+        firsts = [first_of(place, 50) for place in places]
+        assert firsts[:2] == [first, first + 50]
+        assert all(first <= seed <= end - 50 for seed in firsts)

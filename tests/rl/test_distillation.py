@@ -37,9 +37,9 @@ from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
-from lerobot_wmrl.rl.labels import (
-    LabelBatch,
-    Labels,
+from lerobot_wmrl.rl.expert_labels import (
+    ExpertLabelBatch,
+    ExpertLabels,
     Windows,
     action_windows,
     imagined_labels,
@@ -408,7 +408,7 @@ def test_what_hardly_varied_where_the_policy_was_trained_is_left_as_it_is(
         in capsys.readouterr().err
     )
     train(monkeypatch, *flags)
-    labels = Labels(output_dir / "labels", 0)
+    labels = ExpertLabels(output_dir / "labels", 0)
     labels.load(3)
     for part in labels.imagined:
         actions = part.actions["action"]
@@ -479,7 +479,7 @@ def test_a_chunk_ends_with_its_run_and_repeats_the_last_action():
 
 
 def test_labels_are_the_same_when_they_are_read_again(tmp_path: Path):
-    labels = Labels(tmp_path, 0)
+    labels = ExpertLabels(tmp_path, 0)
     for iteration in range(3):
         count = 2 * iteration  # the first iteration has none
         part = {
@@ -487,8 +487,8 @@ def test_labels_are_the_same_when_they_are_read_again(tmp_path: Path):
             "task": torch.zeros(count, dtype=torch.long),
         }
         actions = {"action": iteration + torch.arange(float(count))[:, None] / 10}
-        labels.add(iteration, LabelBatch(part, actions, torch.arange(count), [f"task {iteration}"]))
-    again = Labels(tmp_path, 0)
+        labels.add(iteration, ExpertLabelBatch(part, actions, torch.arange(count), [f"task {iteration}"]))
+    again = ExpertLabels(tmp_path, 0)
     again.load(3)
     assert len(again) == len(labels) == 6
     for store in (labels, again):

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
-from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.pipeline import Pipeline
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.grpo import GRPO

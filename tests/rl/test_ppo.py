@@ -70,11 +70,11 @@ def test_a_step_that_is_much_too_long_is_undone_and_the_next_are_shorter(
         before = [parameter.detach().clone() for parameter in algorithm.policy_parameters]
         algorithm.update(iter(minibatches))
         assert all(torch.equal(a, b) for a, b in zip(algorithm.policy_parameters, before, strict=True))
-        shortened = algorithm.policy_group["lr"]
+        shortened = algorithm.trust_region.group["lr"]
         assert 0.1 <= shortened < 1
-        algorithm.policy_group["lr"] = 1e-4
+        algorithm.trust_region.group["lr"] = 1e-4
         algorithm.update(iter(minibatches))
-        assert algorithm.policy_group["lr"] == pytest.approx(1.1e-4), "shorter for a while alone"
+        assert algorithm.trust_region.group["lr"] == pytest.approx(1.1e-4), "shorter for a while alone"
         assert not any(torch.equal(a, b) for a, b in zip(algorithm.policy_parameters, before, strict=True))
 
 
@@ -82,9 +82,9 @@ def test_the_learning_rate_does_not_rise_where_the_target_kl_ends_an_iteration(
     make_policy: MakePolicy, pipeline: Pipeline
 ) -> None:
     algorithm, buffer = one_rollout(make_policy(), pipeline, policy_lr=5e-3, minibatch_size=32, epochs=9)
-    algorithm.policy_group["lr"] = 2e-3
+    algorithm.trust_region.group["lr"] = 2e-3
     update(algorithm, buffer, pipeline)
-    assert algorithm.policy_group["lr"] == 2e-3
+    assert algorithm.trust_region.group["lr"] == 2e-3
 
 
 def test_the_objective_stops_paying_outside_the_clip() -> None:
@@ -178,7 +178,7 @@ def test_training_stops_far_from_the_reference(make_policy: MakePolicy, pipeline
     update(algorithm, buffer, pipeline)
     collect(PointEnv(16, horizon=6), policy, pipeline, buffer, seed=0)
     with pytest.raises(TrainingStopped, match="max_reference_kl"):
-        algorithm.prepare(buffer, pipeline)
+        algorithm.make_minibatches(buffer, pipeline)
 
 
 def test_training_stops_where_nothing_is_rewarded(make_policy: MakePolicy, pipeline: Pipeline) -> None:

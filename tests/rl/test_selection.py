@@ -11,9 +11,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig, PushtEnv
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
-from lerobot_wmrl.common.constants import SELECTION_SEED
 from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.policies import LoadedPolicy
+from lerobot_wmrl.common.seeds import SELECTION_SEED
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.envs import start_frames, world_model_env
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv

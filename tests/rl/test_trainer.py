@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
-from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.pipeline import Pipeline
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.ppo import PPO

@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wmrl.common.constants import EVALUATION_SEED, START_SEED
+from lerobot_wmrl.common.constants import START_SEED
 from lerobot_wmrl.common.presets import preset_settings
+from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes

@@ -15,8 +15,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from safetensors.torch import load_file
 
-from lerobot_wmrl.common.constants import GATE_SEED, START_SEED
+from lerobot_wmrl.common.constants import START_SEED
 from lerobot_wmrl.common.errors import STOPPED
+from lerobot_wmrl.common.seeds import GATE_SEED
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes

@@ -4,7 +4,7 @@ import torch
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig, TokenizerConfig
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, feature_distance, motion_weight
-from lerobot_wmrl.world_models.modeling_frame_tokenizer import FrameTokenizerRewardModel
+from lerobot_wmrl.world_models.modeling_frame_tokenizer import COLLAPSE_STEPS, FrameTokenizerRewardModel
 
 
 @pytest.fixture(scope="module")
@@ -79,10 +79,15 @@ def test_a_training_on_frames_of_one_colour_ends_with_the_reason():
     config = FrameTokenizerConfig(tokenizer=TokenizerConfig(["top"], 32, [8, 16]), device="cpu")
     model = FrameTokenizerRewardModel(config).train()
     batch = {"observation.images.top": torch.full((8, 3, 32, 32), 0.5)}
-    model(batch, progress=0.0)
-    with pytest.raises(ValueError, match=r"^distinct_frames: .*observation\.images\.top.* alike"):
+    moving = {"observation.images.top": torch.rand(8, 3, 32, 32)}
+    for _ in range(COLLAPSE_STEPS):
+        model(batch, progress=0.0)
+    for _ in range(2):
+        model(moving, progress=0.2)  # a robot may have waited for a while
+        for _ in range(COLLAPSE_STEPS - 1):
+            model(batch, progress=0.2)
+    with pytest.raises(ValueError, match=r"^distinct_frames: in 20 .*observation\.images\.top.* alike"):
         model(batch, progress=0.2)
-    model({"observation.images.top": torch.rand(8, 3, 32, 32)}, progress=0.2)
 
 
 def test_motion_counts_more_than_background(frames):

@@ -4,6 +4,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.frames import Frames
+from lerobot_wmrl.world_models import goal as goal_module
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
 from lerobot_wmrl.world_models.goal import Goal, imagine_goal
 from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardModel
@@ -29,7 +30,9 @@ def starts() -> Frames:
 
 def imagine(model: TextWorldModelRewardModel, threshold: float, horizon: int = HORIZON) -> Goal:
     model.config.goal_horizon = horizon
-    return imagine_goal(model, starts(), INSTRUCTIONS, threshold)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(goal_module, "GOAL_THRESHOLD", threshold)
+        return imagine_goal(model, starts(), INSTRUCTIONS)
 
 
 def trajectory(model: TextWorldModelRewardModel) -> tuple[Tensor, Tensor]:

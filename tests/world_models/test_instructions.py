@@ -11,8 +11,9 @@ import torch
 from lerobot.policies.factory import get_policy_class
 from torch import Tensor
 
+from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.dataset import TrainingData, open_dataset
+from lerobot_wmrl.data.dataset import ChosenEpisodes, TrainingData, open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, count_tasks, read_episodes
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
@@ -20,6 +21,7 @@ from lerobot_wmrl.evaluation.outcomes import predict_done, seen_outcomes
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
 from lerobot_wmrl.play.graphs import instruction_bytes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+from lerobot_wmrl.scripts import eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
@@ -296,6 +298,35 @@ def test_an_instruction_that_cannot_be_read_is_named_before_training(
         make_sampler(model, read_episodes(open_dataset(root)), None, batch_size=2, seed=0)
     assert decided(Path(root)) is False
     assert "success is told without the instructions, one of which cannot be read: task=" in caplog.text
+
+
+def test_so_is_that_of_an_episode_that_is_held_out(make_synthetic_dataset, trained, tmp_path, monkeypatch):
+    """It is measured on when the training is over."""
+    root = make_synthetic_dataset(tmp_path / "odd", episodes=2, instructions=(PUSH, "x" * 600)).root
+    monkeypatch.setattr(EpisodeTable, "validation", property(lambda table: np.arange(len(table.start)) == 1))
+    with pytest.raises(FieldError, match=r"tokenizer\.instructions=True: task=.*set it to false"):
+        decided(Path(root), instructions=True)
+    model, table = load_model(trained, "action_world_model"), read_episodes(open_dataset(root))
+    with pytest.raises(FieldError, match=r"dataset\.root=.*odd: task=.*`tokenizer\.instructions`=false"):
+        make_sampler(model, table, None, batch_size=2, seed=0)
+    assert len(make_sampler(model, table, [0], batch_size=2, seed=0).episodes) == 1
+
+
+def test_an_evaluation_names_it_before_it_replays(
+    make_synthetic_dataset, trained, trained_models, tmp_path, monkeypatch
+):
+    root = make_synthetic_dataset(tmp_path / "odd", episodes=2, instructions=(PUSH, "x" * 600)).root
+    monkeypatch.setattr(eval_world_model, "measure", lambda *_: None)
+    text = Checkpoint(str(trained_models["text_world_model"]))
+    for path, text_model in ((trained, Checkpoint()), (trained_models["action_world_model"], text)):
+        config = eval_world_model.EvalWorldModelConfig(
+            model=Checkpoint(str(path)), text_model=text_model, output_dir=tmp_path / path.name,
+            dataset=ChosenEpisodes(str(root)), device="cpu",
+        )  # fmt: skip
+        with pytest.raises(FieldError, match=r"dataset\.root=.*odd: task="):
+            eval_world_model.eval_world_model(config)
+        config.dataset.episodes = [0]
+        eval_world_model.eval_world_model(config)
 
 
 def test_one_instruction_is_needed_for_each_frame():

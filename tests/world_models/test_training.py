@@ -22,6 +22,7 @@ from lerobot_wmrl.data.frame_cache import cached_frames, cached_tokens
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
+from lerobot_wmrl.world_models import training_data
 from lerobot_wmrl.world_models.anchored import dynamics as anchored
 from lerobot_wmrl.world_models.autoregressive import dynamics as autoregressive
 from lerobot_wmrl.world_models.checkpoint import load_model
@@ -108,6 +109,25 @@ def test_held_out_episodes_are_not_learnt_from(kind, small_dataset, trained_mode
         learnt = make_sampler(model, table, chosen, batch_size=2, seed=0).episodes
         assert len(learnt)
         assert not held_out[learnt].any()
+
+
+def test_depth_of_held_out_episodes_is_read_before_training(small_dataset, trained_models, monkeypatch):
+    """They are measured on when it is over: what cannot be decoded says so now."""
+    monkeypatch.setattr(EpisodeTable, "validation", property(lambda table: np.arange(6) == 4))
+    table = read_episodes(small_dataset)
+    model = load_model(trained_models["action_world_model"], "action_world_model")
+    monkeypatch.setattr(type(model.config), "depth", True)
+    filled: list[int] = []
+
+    class Depth:
+        def fill(self, rows: np.ndarray) -> None:
+            filled.extend(rows.tolist())
+            raise ValueError("no more is needed")
+
+    monkeypatch.setattr(training_data, "cached_depth", lambda *_: Depth())
+    with pytest.raises(ValueError, match="no more is needed"):
+        make_sampler(model, table, [3, 4], batch_size=2, seed=0)
+    assert filled == table.row_numbers([3, 4]).tolist()
 
 
 @pytest.mark.parametrize("kind", ["action_world_model", "text_world_model"])

@@ -12,11 +12,11 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import LiberoEnv
 
 from lerobot_wmrl.common.checkpoints import model_folder
-from lerobot_wmrl.common.constants import GATE_SEED
 from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.lerobot_commands import env_flags
 from lerobot_wmrl.common.presets import format_flags
+from lerobot_wmrl.common.seeds import GATE_SEED
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.dataset import DatasetSource
@@ -29,7 +29,7 @@ from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl import recorders
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
-from lerobot_wmrl.rl.gate import SuccessGate
+from lerobot_wmrl.rl.gate_callback import SuccessGate
 from lerobot_wmrl.rl.recorders import ManiSkillRecorder
 from lerobot_wmrl.world_models.checkpoint import load_model
 
@@ -202,7 +202,7 @@ def test_either_source_of_rollouts_fails_the_world_model(
             recall=Proportion(1, 1), cut_short=0, repeats_last=False, auc=1.0,
         )  # fmt: skip
 
-    monkeypatch.setattr("lerobot_wmrl.rl.gate.gate_at", verdict)
+    monkeypatch.setattr("lerobot_wmrl.rl.gate_callback.gate_at", verdict)
     config = GateConfig(dataset=DatasetSource(str(small_dataset.root)), n_episodes=5, limit=0.5)
     gate = SuccessGate(config, env, Recorder(), frozenset(), total=8)
     assert gate.run(0, tmp_path, tmp_path / "first")["failed"] == failed

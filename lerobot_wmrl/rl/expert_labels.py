@@ -1,4 +1,6 @@
-"""Observations labelled with actions to imitate, on the CPU and on disk. N labels, n steps of a window."""
+"""Observations labelled with an expert's actions, which distillation imitates: the planner's in imagination,
+those of recorded successes. In memory and on disk. N labels, n steps of a window.
+"""
 
 import json
 import math
@@ -28,7 +30,7 @@ from lerobot_wmrl.envs.start_frames import every_chosen_episode
 from lerobot_wmrl.rl.observations import ObservationBuffer, as_policy_input
 
 ROWS = "rows"
-"""Name of `LabelBatch.rows` in a file of labels."""
+"""Name of `ExpertLabelBatch.rows` in a file of labels."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Windows:
 
 
 @dataclass(frozen=True)
-class LabelBatch:
+class ExpertLabelBatch:
     """N labels from one place, whose windows share F observations.
 
     Args:
@@ -81,8 +83,9 @@ class LabelBatch:
         return as_policy_input(observations | actions, self.instructions)
 
 
-class Labels:
-    """Labels of a dataset, and those of all iterations, one file each, so that a resumed training has them.
+class ExpertLabels:
+    """Labels of recorded successes, and of each iteration's imagined episodes, one file an iteration, so that
+    a resumed training has them.
 
     Args:
         folder: folder of the files.
@@ -91,8 +94,8 @@ class Labels:
 
     def __init__(self, folder: Path, process: int) -> None:
         self.folder, self.process = folder, process
-        self.recorded: list[LabelBatch] = []
-        self.imagined: list[LabelBatch] = []
+        self.recorded: list[ExpertLabelBatch] = []
+        self.imagined: list[ExpertLabelBatch] = []
 
     def __len__(self) -> int:
         return sum(map(len, (*self.recorded, *self.imagined)))
@@ -101,7 +104,7 @@ class Labels:
         """Return the file of an iteration."""
         return self.folder / f"{iteration:06d}-{self.process}.safetensors"
 
-    def add(self, iteration: int, part: LabelBatch) -> None:
+    def add(self, iteration: int, part: ExpertLabelBatch) -> None:
         """Add an iteration's labels, on disk first."""
         self.folder.mkdir(parents=True, exist_ok=True)
         partial = self.path(iteration).with_suffix(".partial")
@@ -146,12 +149,12 @@ class Labels:
         rows = tensors.pop(ROWS)
         actions = {name: tensors.pop(name) for name in (ACTION, ACTION_IS_PAD) if name in tensors}
         if len(rows):
-            self.imagined.append(LabelBatch(tensors, actions, rows, instructions))
+            self.imagined.append(ExpertLabelBatch(tensors, actions, rows, instructions))
 
 
 def recorded_successes(
     source: StartFrames, frame_shapes: Mapping[str, tuple[int, int, int]], state_size: int, windows: Windows
-) -> list[LabelBatch]:
+) -> list[ExpertLabelBatch]:
     """Return the actions of a dataset's successful episodes as labels; nothing without a dataset or success.
 
     Args:
@@ -184,7 +187,7 @@ def recorded_successes(
         rows = (start - begin)[episode] + torch.arange(len(episode))
         observations[OBS_STATE] = torch.from_numpy(table.state[rows.numpy()])
     step, labelled = acting.nonzero(as_tuple=True)
-    return [LabelBatch(
+    return [ExpertLabelBatch(
         observations | {INSTRUCTIONS: episode}, actions,
         observed_rows(begin[labelled], step, windows.observations),
         [table.instructions[each] for each in episodes],
@@ -218,7 +221,7 @@ def require_memory(source: StartFrames, frame_shapes: Mapping[str, tuple[int, in
 
 def imagined_labels(
     observations: ObservationBuffer, actions: Tensor, labelled: Tensor, windows: Windows
-) -> LabelBatch:
+) -> ExpertLabelBatch:
     """Return the labelled steps of a rollout.
 
     Args:
@@ -230,7 +233,7 @@ def imagined_labels(
     step, env = labelled.nonzero(as_tuple=True)
     wanted = observed_rows(env, step, windows.observations, observations.num_envs)
     kept, rows = wanted.unique(return_inverse=True)
-    return LabelBatch(
+    return ExpertLabelBatch(
         observations.read_stored(kept.cpu()), action_windows(actions, labelled, windows.actions), rows,
         list(observations.instructions),
     )  # fmt: skip

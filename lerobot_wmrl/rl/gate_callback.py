@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from termcolor import colored
 
-from lerobot_wmrl.common.constants import GATE_SEED
 from lerobot_wmrl.common.errors import TrainingStopped
+from lerobot_wmrl.common.seeds import gate_seed
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
@@ -27,9 +27,6 @@ from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
 from lerobot_wmrl.rl.recorders import Recorder
-
-SEEDS = 1_000_000
-"""Number of seeds from GATE_SEED on."""
 
 LABELLED, FRESH = "labelled", "fresh"
 """Sources of rollouts: `gate.dataset`, or new ones of the current policy."""
@@ -116,7 +113,7 @@ class SuccessGate:
     def _fresh(self, recorder: Recorder, iteration: int, checkpoint: Path, folder: Path) -> Recording:
         """Record the current policy, from seeds that no earlier rollouts had."""
         episodes = self.config.n_episodes
-        recorder.record(checkpoint, episodes, first_rollout_seed(iteration, episodes), folder)
+        recorder.record(checkpoint, episodes, gate_seed(iteration * episodes, episodes), folder)
         return labelled_recording(self.env.model, read_episodes(open_dataset(folder)))
 
     def _above(self, verdict: Gate) -> bool:
@@ -140,11 +137,6 @@ class SuccessGate:
         if not any(verdict.false_positives.n for verdict in verdicts.values()):
             return f"Gate, iteration {iteration}: no rollout failed, so false positives were not counted"
         return None
-
-
-def first_rollout_seed(iteration: int, episodes: int) -> int:
-    """Return the seed of the first of the rollouts that are recorded after an iteration."""
-    return GATE_SEED + iteration * episodes % (SEEDS - episodes)
 
 
 def save_strips(
