@@ -13,7 +13,7 @@ from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_wmrl.common.constants import POLICY
 from lerobot_wmrl.common.errors import renamed
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.presets import flag_as_typed
+from lerobot_wmrl.common.flags import flag_as_typed
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.features import describe_alike

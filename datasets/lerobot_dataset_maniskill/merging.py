@@ -11,8 +11,8 @@ from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot_dataset_maniskill.card import CARD_FILE, success_by_kind, write_card
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE, find_damage, write_vocabulary
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.flags import flag_as_typed
 from lerobot_wmrl.common.output_folders import different_settings, require_same
-from lerobot_wmrl.common.presets import flag_as_typed
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.maniskill.embodiment import FPS

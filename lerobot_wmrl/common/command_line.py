@@ -25,8 +25,9 @@ from lerobot.utils.utils import init_logging
 
 from lerobot_wmrl.common.errors import STOPPED, FieldError, Stopped
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.flags import TYPE, format_flags, format_value
 from lerobot_wmrl.common.output_folders import RUN_CONFIG_FILE
-from lerobot_wmrl.common.presets import TYPE, format_flags, format_value, read_settings
+from lerobot_wmrl.common.presets import read_settings
 from lerobot_wmrl.common.settings import (
     Setting,
     help_page,

@@ -1,22 +1,14 @@
-"""LeRobot's own commands as stages, each of which can be called again after an interruption, and its
-environments as flags."""
+"""LeRobot's own commands as stages, each of which can be called again after an interruption."""
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any
 
-import draccus
-from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, step_folders
+from lerobot_wmrl.common.flags import Flags, format_lerobot_flags
 from lerobot_wmrl.common.hub import cached_repo
-from lerobot_wmrl.common.presets import Flags, format_lerobot_flags
-
-DERIVED = ("features", "features_map")
-"""Settings of an environment that are derived from others."""
 
 
 def train_command(folder: Path, flags: Sequence[str]) -> list[str]:
@@ -58,31 +50,3 @@ def edit_advice(root: str | Path, operation: str, flags: Flags) -> str:
     copied = source if repo is None else Path("data") / repo.rpartition("--")[2]
     flags = {"repo_id": f"local/{copied.name}", "root": str(source), **flags}
     return shlex.join(edit_command(copied.with_name(f"{copied.name}_edited"), operation, flags))
-
-
-def flat(settings: Any, encoded: Mapping[str, Any]) -> dict[str, Any]:
-    """Return encoded settings by their flags' names; those that are mappings stay whole, as one flag each."""
-    found: dict[str, Any] = {}
-    for name, value in encoded.items():
-        part = getattr(settings, name, None)
-        if is_dataclass(part):
-            found |= {f"{name}.{inner}": each for inner, each in flat(part, value).items()}
-        else:
-            found[name] = value
-    return found
-
-
-def env_flags(env: EnvConfig, prefix: str = "env") -> Flags:
-    """Return `env.type` and the settings that differ from their defaults, as a command takes them.
-
-    prefix: prefix of the flags, `env` or `real_env`.
-    """
-    given, default = (flat(each, draccus.encode(each, EnvConfig)) for each in (env, type(env)()))
-    differing = [name for name in given if given[name] != default.get(name)]
-    chosen = {
-        name
-        for name in given
-        if name.endswith(".type") and any(each.startswith(name.removesuffix("type")) for each in differing)
-    }
-    kept = [name for name in given if name in {*differing, *chosen} and name.split(".")[0] not in DERIVED]
-    return {f"{prefix}.type": env.type, **{f"{prefix}.{name}": given[name] for name in kept}}

@@ -1,7 +1,7 @@
 """What a policy must have in common with an environment, a dataset or a training."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import torch
 from lerobot.configs import PreTrainedConfig
@@ -10,6 +10,10 @@ from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
+
+WIDEST_STD: Final = 2.0
+"""Standard deviation of a policy's actions, in widths of an environment's range, beyond which they are in
+other units. Within a range it is at most half of its width."""
 
 
 def adopt_features(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]]) -> None:
@@ -131,12 +135,12 @@ def check_units(
 ) -> None:  # fmt: skip
     """Raise FieldError if a policy's actions are in other units than an environment's.
 
-    This is seen from the mean of the actions that the policy was trained on: it must not lie farther outside
-    of the environment's range than this is wide.
+    This is seen from the actions that the policy was trained on: no component's mean may lie farther outside
+    of the environment's range than this is wide, nor may most components vary far more than it is wide.
 
     Args:
         config: the policy's.
-        postprocessor: the policy's, which knows that mean, if actions are normalised.
+        postprocessor: the policy's, which knows mean and standard deviation, if actions are normalised.
         names: one for each component of an action.
         low, high: the range of the environment's actions. (A,), (A,)
         where: what the error calls the environment.
@@ -152,6 +156,26 @@ def check_units(
                 f"{where} it is between {least[component]:.4g} and {most[component]:.4g}",
                 "use a policy with the same actions in the same units",
             )  # fmt: skip
+    for (std,) in _action_statistics(postprocessor, "std"):
+        spread, least, most = (torch.as_tensor(each).flatten().cpu().double() for each in (std, low, high))
+        check_spread(config, spread, names, least, most, where)
+
+
+def check_spread(
+    config: PreTrainedConfig, std: Tensor, names: Sequence[str], least: Tensor, most: Tensor, where: str
+) -> None:
+    """Raise FieldError if most components of a policy's actions have a standard deviation of more than
+    `WIDEST_STD` times the width of an environment's range."""
+    strange = std > WIDEST_STD * (most - least)
+    if strange.double().mean() > 0.5:
+        component = int(strange.nonzero()[0])
+        raise FieldError(
+            "policy.path", config.pretrained_path,
+            f"was trained on actions whose {names[component]} has a standard deviation of "
+            f"{std[component]:.4g}, in {where} it is between {least[component]:.4g} and "
+            f"{most[component]:.4g}, and others are like it",
+            "use a policy with the same actions in the same units: displacements are no targets",
+        )  # fmt: skip
 
 
 def learnt_range(postprocessor: Any) -> tuple[Tensor, Tensor] | None:

@@ -5,9 +5,6 @@ further right overrides it. Where a command differs by what it trains, the file 
 Every file is a configuration that LeRobot's `--config_path=FILE` reads too.
 """
 
-import json
-import re
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -15,18 +12,12 @@ from typing import Any, Final
 
 import yaml
 
-type Flags = Mapping[str, str | int | float | bool | list[int] | list[str]]
+from lerobot_wmrl.common.flags import TYPE, format_flags
 
 PRESETS: Final = ("tiny", "demo", "cpu", "gpu", "paper")
 """From seconds to the published sizes."""
 
 FOLDER: Final = Path(str(files("lerobot_wmrl") / "presets"))
-
-TYPE: Final = ".type"
-"""Ends the flags that choose one of several classes, which share a prefix but not their settings."""
-
-TAKEN_AS_TYPED: Final = re.compile(r"(^|\.)(path|config_path)$")
-"""Flags that LeRobot takes from the command line before draccus reads it."""
 
 
 def expand_preset(argv: Sequence[str], command: str) -> list[str]:
@@ -131,45 +122,3 @@ def _flat(content: Mapping[str, Any], whole: Sequence[str], prefix: str = "") ->
             yield from _flat(value, whole, f"{name}.")
         else:
             yield name, value
-
-
-def format_flags(settings: Mapping[str, Any]) -> list[str]:
-    """Write settings as draccus parses them: `{"a.b": 1, "c": True}` → `["--a.b=1", "--c=true"]`."""
-    return [f"--{name}={format_value(value)}" for name, value in settings.items()]
-
-
-def format_lerobot_flags(settings: Mapping[str, Any]) -> list[str]:
-    """Write settings for a command of LeRobot's own, which reads texts as YAML, as ours do not: a dataset in
-    `2024_01_15` has quotation marks. It takes checkpoints (`policy.path`) as they are."""
-    return [
-        f"--{name}={_format_text(str(value), listed=False)}"
-        if isinstance(value, str | Path) and not TAKEN_AS_TYPED.search(name)
-        else f"--{name}={format_value(value)}"
-        for name, value in settings.items()
-    ]
-
-
-def flag_as_typed(name: str, value: Any) -> str:
-    """Return a flag as one types it in a shell, whatever its value has in it: `'--dataset.root=my data'`."""
-    return shlex.join(format_flags({name: value}))
-
-
-def format_value(value: Any) -> str:
-    """Write a setting as YAML in one line."""
-    if isinstance(value, list | tuple):
-        return f"[{','.join(map(_format_element, value))}]"
-    return json.dumps(value) if isinstance(value, bool | dict | None) else str(value)
-
-
-def _format_element(value: Any) -> str:
-    return _format_text(str(value), listed=True) if isinstance(value, str | Path) else format_value(value)
-
-
-def _format_text(text: str, listed: bool) -> str:
-    """Write a text, in quotation marks if YAML would not read it as the same one."""
-    written, meant = (f"[{text}]", [text]) if listed else (text, text)
-    try:
-        plain = yaml.safe_load(written) == meant
-    except yaml.YAMLError:
-        plain = False
-    return text if plain else json.dumps(text, ensure_ascii=False)

@@ -17,7 +17,8 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from draccus.choice_types import ChoiceType
 
-from lerobot_wmrl.common.presets import FOLDER, format_value, presets_of
+from lerobot_wmrl.common.flags import format_value
+from lerobot_wmrl.common.presets import FOLDER, presets_of
 
 WIDTH = 110
 """Characters a line of `--help`."""

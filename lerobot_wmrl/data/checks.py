@@ -1,6 +1,7 @@
 """What a dataset must have for a model: cameras, depth, widths, statistics, success that is shown."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,18 +31,25 @@ def shows_colours(feature: Mapping[str, Any]) -> bool:
     return feature["dtype"] in ("image", "video") and not depth
 
 
-def check_cameras(features: Mapping[str, Any], camera_keys: Sequence[str], field: str | None = None) -> None:
-    """Raise ValueError unless the dataset has these cameras.
+def check_cameras(meta: Any, camera_keys: Sequence[str], field: str | None = None) -> None:
+    """Raise FieldError unless a dataset has these cameras.
 
-    It is a FieldError about `field`, the setting of the cameras, unless a trained model has learnt them.
+    Args:
+        meta: the dataset's metadata, a LeRobotDatasetMetadata.
+        camera_keys: the cameras.
+        field: the setting that names them, which the error is about; None: a trained model has learnt them,
+            and the dataset is another one.
     """
+    features = meta.features
     coloured = [name for name, feature in features.items() if shows_colours(feature)]
     for key in camera_keys:
         if key not in coloured:
             cameras = ", ".join(coloured) or "none"
             problem = f"the dataset has no {key} (its cameras: {cameras})"
             if field is None:
-                raise ValueError(f"{problem}, which the model has learnt to look at; use one that has it")
+                raise FieldError(
+                    "dataset.root", meta.root, f"{problem}, which the model looks at", "use one that has it"
+                )
             raise FieldError(
                 field, camera_names(camera_keys), problem,
                 f"set `{field}` to match, or use a dataset with this camera",
@@ -79,15 +87,18 @@ def require_shown(table: EpisodeTable, episodes: Iterable[int]) -> None:
         )  # fmt: skip
 
 
-def check_widths(features: Mapping[str, Any], wanted: Mapping[str, int]) -> None:
-    """Raise ValueError unless the features have as many components as a model was trained with, 0 for any."""
+def check_widths(meta: Any, wanted: Mapping[str, int]) -> None:
+    """Raise FieldError unless a dataset's features have as many components as a model was trained with, 0 for
+    any. meta: its metadata, a LeRobotDatasetMetadata."""
     for name, width in wanted.items():
-        size = features[name]["shape"][0] if name in features else 0
+        size = meta.features[name]["shape"][0] if name in meta.features else 0
         if width and size != width:
-            raise ValueError(
+            raise FieldError(
+                "dataset.root", meta.root,
                 f"{name}: the world model was trained with {width} components, the dataset has "
-                f"{size or 'none'}; use a dataset like the one it was trained on"
-            )
+                f"{size or 'none'}",
+                "use a dataset like the one it was trained on",
+            )  # fmt: skip
 
 
 def check_statistics(meta: Any, key: str) -> None:
@@ -116,10 +127,11 @@ def solved_from_the_start(table: EpisodeTable) -> str | None:
     )
 
 
-def check_episode_lengths(meta: Any) -> None:
-    """Raise FieldError if no episode has a second frame to predict."""
-    if meta.total_frames <= meta.total_episodes:
+def check_episode_lengths(root: Path, episodes: int, frames: int) -> None:
+    """Raise FieldError if none of the episodes, which have so many frames in all, has a second one to
+    predict."""
+    if frames <= episodes:
         raise FieldError(
-            "dataset.root", meta.root, f"{meta.total_episodes} episodes of {meta.total_frames} frames in all",
-            "a world model learns from episodes of two frames or more: record longer ones",
+            "dataset.root", root, f"{episodes} episodes to learn from, of {frames} frames in all",
+            "a world model learns from episodes of two frames or more: record longer ones, or choose others",
         )  # fmt: skip

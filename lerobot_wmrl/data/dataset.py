@@ -11,7 +11,7 @@ import pyarrow.compute
 import pyarrow.dataset
 from huggingface_hub import snapshot_download
 from huggingface_hub.file_download import repo_folder_name
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.dataset_metadata import CODEBASE_VERSION, LeRobotDatasetMetadata
 from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import EPISODES_DIR, BackwardCompatibilityError
@@ -19,7 +19,7 @@ from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
 from lerobot.utils.utils import SuppressProgressBars
 
 from lerobot_wmrl.common.errors import FieldError, first_line, renamed
-from lerobot_wmrl.common.presets import flag_as_typed
+from lerobot_wmrl.common.flags import flag_as_typed
 from lerobot_wmrl.data.embodiment import whole_rate
 from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes
 
@@ -81,7 +81,7 @@ class DatasetSource:
             raise FieldError(
                 "dataset.root", self.root, "no dataset is named", "give `dataset.root` or `dataset.repo_id`"
             )
-        if not self.repo_id or (self.root and is_whole(Path(self.root), episodes)):
+        if not self.repo_id or (self.root and (is_whole(Path(self.root), episodes) or unfinished(self.root))):
             return open_dataset(self.root, self.repo_id, episodes)
         try:
             return download_dataset(self.repo_id, self.revision, self.root or None, episodes)
@@ -139,6 +139,12 @@ def open_dataset(
         raise FieldError(
             "dataset.root", root, "no LeRobotDataset there (meta/info.json is missing)", "record one first"
         )
+    if unfinished(root):
+        raise FieldError(
+            "dataset.root", root,
+            f"its recording was not finished: it has no table of episodes ({EPISODES_DIR})",
+            "record it again: LeRobot writes the table when a recording ends",
+        )  # fmt: skip
     name = repo_id or Path(root).absolute().name
     try:
         lacking = missing_files(Path(root))
@@ -263,6 +269,19 @@ def is_whole(root: Path, episodes: Collection[int] | None = None) -> bool:
     try:
         return not missing_files(root, episodes)
     except (OSError, ValueError):  # a table that is torn, or one of several
+        return False
+
+
+def unfinished(root: str | Path) -> bool:
+    """Return whether a folder holds a recording that was stopped: it has no table of episodes, nor is it a
+    download."""
+    root = Path(root)
+    if not (root / "meta" / "info.json").is_file() or any((root / EPISODES_DIR).glob("*/*.parquet")):
+        return False
+    downloaded = (root / ".cache" / "huggingface").is_dir()
+    try:
+        return not downloaded and load_info(root).codebase_version == CODEBASE_VERSION
+    except (OSError, ValueError, TypeError):  # of an older version, which LeRobot names, or torn
         return False
 
 

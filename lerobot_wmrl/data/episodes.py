@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 
 from lerobot_wmrl.common.constants import START_TASK
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.flags import flag_as_typed
 from lerobot_wmrl.common.lerobot_commands import edit_advice
-from lerobot_wmrl.common.presets import flag_as_typed
 from lerobot_wmrl.common.statistics import evenly_spaced
 
 EPISODES_A_TASK: Final = 5

@@ -26,7 +26,7 @@ from filelock import FileLock
 from lerobot_wmrl.common.constants import KINDS, PLAY, POLICY, START_COLUMNS, START_KIND
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.presets import Flags
+from lerobot_wmrl.common.flags import Flags
 from lerobot_wmrl.data.episodes import EpisodeTable
 
 DEMONSTRATIONS: Final = "demonstrations"

@@ -8,9 +8,10 @@ from typing import Any, Final
 from lerobot_wmrl.common.checkpoints import last_model
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
-from lerobot_wmrl.common.lerobot_commands import env_flags, train_command
+from lerobot_wmrl.common.flags import Flags, env_flags, format_flags
+from lerobot_wmrl.common.lerobot_commands import train_command
 from lerobot_wmrl.common.policies import read_policy_config
-from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags, presets_of
+from lerobot_wmrl.common.presets import preset_flags, presets_of
 from lerobot_wmrl.common.seeds import EVALUATION_SEED, require_seed
 from lerobot_wmrl.common.stages import Stage
 from lerobot_wmrl.common.tracking import read_metrics
@@ -25,6 +26,7 @@ from lerobot_wmrl.improve.report.curves import curve, lerobot_train_curve
 from lerobot_wmrl.improve.report.page import Page, stage_records
 from lerobot_wmrl.improve.report.words import verdict
 from lerobot_wmrl.improve.results import read_place
+from lerobot_wmrl.improve.stage_names import StageName
 
 SEEDS_A_DEMO: Final = 100_000
 """Demo seed s records and trains with seeds from s·SEEDS_A_DEMO on, below EVALUATION_SEED."""
@@ -108,7 +110,7 @@ class Demo:
         improvement = self.improvement()
         titles = [*improvement.policies]
         folders = {
-            "in known scenes": self.improved / "comparison",
+            "in known scenes": self.improved / StageName.COMPARISON,
             "in unseen scenes": self.out / "unseen",
             "in imagination, from frames of the dataset": self.out / "imagined",
         }
@@ -185,26 +187,29 @@ class Demo:
 
     def _text_world_model(self) -> list[str]:
         return self._command("lerobot-wmrl-train-world-model", {
-            "model.type": "text_world_model", "model.tokenizer_path": str(self.improved / "tokenizer"),
-            "dataset.root": str(self.improved / "merged"), "seed": self.first_seed,
+            "model.type": "text_world_model",
+            "model.tokenizer_path": str(self.improved / StageName.TOKENIZER),
+            "dataset.root": str(self.improved / StageName.MERGED), "seed": self.first_seed,
             "output_dir": str(self.out / "text_world_model"),
         })  # fmt: skip
 
     def _replay(self) -> list[str]:
         return self._command("lerobot-wmrl-eval-world-model", {
-            "model.path": str(self.improved / "world_model"), "split": "validation",
+            "model.path": str(self.improved / StageName.WORLD_MODEL), "split": "validation",
             "text_model.path": str(self.out / "text_world_model"),
-            "dataset.root": str(self.improved / "merged"), "output_dir": str(self.out / "replay"),
+            "dataset.root": str(self.improved / StageName.MERGED), "output_dir": str(self.out / "replay"),
         })  # fmt: skip
 
     def _unseen(self) -> list[str]:
         env = env_flags(WmrlManiSkillEnv(**UNSEEN))
-        return commands.compare(self.improvement(), self.out / "unseen", env, self.config.eval_episodes)
+        return commands.compare_command(
+            self.improvement(), self.out / "unseen", env, self.config.eval_episodes
+        )
 
     def _imagined(self) -> list[str]:
         improvement = self.improvement()
         env = commands.imagination(improvement)
-        return commands.compare(improvement, self.out / "imagined", env, self.config.eval_episodes)
+        return commands.compare_command(improvement, self.out / "imagined", env, self.config.eval_episodes)
 
     def _command(self, program: str, flags: Flags) -> list[str]:
         """Return a command of this package, at the demo's size."""
@@ -216,5 +221,5 @@ def conclusion(page: Page, path: Path) -> str:
     return "\n".join([
         verdict(page.progress, page.places), "", f"The report: {path}",
         "Next: open it; it ends with every command, to change and run by hand. Drive the world model:",
-        shlex.join(commands.drive(page.progress)),
+        shlex.join(commands.drive_command(page.progress)),
     ])  # fmt: skip

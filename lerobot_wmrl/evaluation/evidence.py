@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
@@ -154,11 +154,11 @@ def trained_inside(policy: str, world_model: str) -> str | None:
     Trainings are followed back as far as their settings lie on this machine. Any checkpoint of the training
     that made the world model counts, one that was trained further on new rollouts (Dyna) too.
     """
-    ancestors = [path for path, _ in _trainings(world_model, "model")]
+    ancestors = [training.checkpoint for training in _trainings(world_model, "model")]
     folders = Path(world_model).resolve().parents
-    for checkpoint, settings in _trainings(policy, "policy"):
-        used = (settings.get("env") or {}).get("world_model_path")
-        inside = training_folder(checkpoint) / DYNA in folders
+    for training in _trainings(policy, "policy"):
+        used = training.located((training.settings.get("env") or {}).get("world_model_path"))
+        inside = training_folder(training.checkpoint) / DYNA in folders
         if used and (inside or any(same_training(used, each) for each in ancestors)):
             return (
                 "it was trained in this world model, and may have learnt what only looks like success there"
@@ -175,9 +175,11 @@ def learnt_from(world_model: str, rollouts: LabelledRollouts) -> int:
     Trainings that it was continued from count too, and that of a tokenizer which tells success, as far as
     their settings and data lie on this machine.
     """
-    sources = [settings.get("dataset") or {} for _, settings in _trainings(world_model, "model")]
-    learnt = [(root, source.get("episodes")) for source in sources for root in _folders(source, rollouts)]
-    learnt += [(str(more), None) for source in sources for more in source.get("more", ())]
+    learnt: list[tuple[str, Sequence[int] | None]] = []
+    for training in _trainings(world_model, "model"):
+        source = training.settings.get("dataset") or {}
+        learnt += [(root, source.get("episodes")) for root in _folders(training, rollouts)]
+        learnt += [(training.located(more), None) for more in source.get("more", ())]
     table, elsewhere = rollouts.table, set[str]()
     themselves = np.zeros(len(table.start), bool)
     for root, episodes in learnt:
@@ -189,12 +191,13 @@ def learnt_from(world_model: str, rollouts: LabelledRollouts) -> int:
     return int((themselves[rollouts.chosen] | np.array(copied, bool)).sum())
 
 
-def _folders(source: Mapping[str, Any], rollouts: LabelledRollouts) -> list[str]:
+def _folders(training: "Training", rollouts: LabelledRollouts) -> list[str]:
     """Return where the dataset that a training was given lies on this machine: where the rollouts do, if they
     have its name."""
+    source = training.settings.get("dataset") or {}
     root, repo_id = source.get("root"), source.get("repo_id")
     if root or not repo_id:
-        return [str(root)] if root else []
+        return [training.located(root)] if root else []
     return [str(rollouts.root)] if repo_id == rollouts.name else [str(path) for path in local_copies(repo_id)]
 
 
@@ -214,8 +217,27 @@ def action_digests(table: EpisodeTable, episodes: np.ndarray) -> list[str]:
     return [sha256(table.action[rows].astype("<f4").tobytes()).hexdigest() for rows in table.rows(episodes)]
 
 
-def _trainings(checkpoint: str, trained: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield a checkpoint and the settings of the training that made it, then those that it goes back to.
+class Training(NamedTuple):
+    """A checkpoint, and the settings of the training that made it, nothing if they are not here."""
+
+    checkpoint: str
+    settings: Mapping[str, Any]
+
+    def located(self, path: object) -> str:
+        """Return where something lies that the settings name: relative paths are from where the training ran,
+        which its own `output_dir` tells. "" for nothing; as it is if it is not there, such as a hub id."""
+        if not path:
+            return ""
+        folder = training_folder(self.checkpoint)
+        parts = Path(str(self.settings.get("output_dir") or "")).parts
+        if not parts or folder.parts[-len(parts) :] != parts:
+            return str(path)
+        place = Path(*folder.parts[: -len(parts)], str(path))
+        return str(place if place.exists() else path)
+
+
+def _trainings(checkpoint: str, trained: str) -> Iterator[Training]:
+    """Yield a checkpoint with the training that made it, then those that it goes back to.
 
     trained: name of the settings of what was trained, `policy` or `model`.
     """
@@ -224,13 +246,13 @@ def _trainings(checkpoint: str, trained: str) -> Iterator[tuple[str, Mapping[str
         if (checkpoint := ahead.pop(0)) in visited:
             continue
         visited.add(checkpoint)
-        settings = stored_settings(model_folder(checkpoint) / RUN_CONFIG_FILE)
-        yield checkpoint, settings
-        made = settings.get(trained) or {}
-        if began := made.get("pretrained_path"):
-            ahead.append(str(began))
-        if (tokenizer := made.get("tokenizer_path")) and tells_success(tokenizer):
-            ahead.append(str(tokenizer))
+        training = Training(checkpoint, stored_settings(model_folder(checkpoint) / RUN_CONFIG_FILE))
+        yield training
+        made = training.settings.get(trained) or {}
+        if began := training.located(made.get("pretrained_path")):
+            ahead.append(began)
+        if (tokenizer := training.located(made.get("tokenizer_path"))) and tells_success(tokenizer):
+            ahead.append(tokenizer)
 
 
 def tells_success(tokenizer: str) -> bool:

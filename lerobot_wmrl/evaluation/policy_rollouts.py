@@ -230,7 +230,8 @@ def require_new_starts(envs: Envs, config: EnvConfig, n_episodes: int) -> None:
     """Raise FieldError if a world model or LIBERO has too few starts: some would count twice."""
     if isinstance(config, WorldModelEnv):
         fewest = min(len(env.env.starts) for env in flat(envs))
-        problem, more = "the world model has {} start frames", ", or give more with `env.dataset.max_starts`"
+        limit = "max_starts" if fewest >= config.dataset.max_starts else "branches"
+        problem, more = "the world model has {} start frames", f", or give more with `env.dataset.{limit}`"
     elif counts_resets(config):
         fewest = min(len(states) for env in flat(envs) for states in env.call("_init_states"))
         problem, more = f"{config.type} has {{}} starts", ", or set `env.init_states` to false"

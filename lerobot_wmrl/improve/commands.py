@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 
 from lerobot_wmrl.common.errors import STOPPED
-from lerobot_wmrl.common.lerobot_commands import edit_command, env_flags, merge_command, train_command
-from lerobot_wmrl.common.presets import Flags, format_flags, format_lerobot_flags
+from lerobot_wmrl.common.flags import Flags, env_flags, format_flags, format_lerobot_flags
+from lerobot_wmrl.common.lerobot_commands import edit_command, merge_command, train_command
 from lerobot_wmrl.common.seeds import EVALUATION_SEED, SELECTION_SEED
 from lerobot_wmrl.common.stages import Stage, never
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -19,6 +19,7 @@ from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET
 from lerobot_wmrl.improve.learnt import MAX_STARTS
 from lerobot_wmrl.improve.plan import Plan
 from lerobot_wmrl.improve.progress import CLONED, Progress
+from lerobot_wmrl.improve.stage_names import StageName
 
 SELECTIONS: Final = 4
 """Measurements of success in the real environment during RL at most, beside one before it."""
@@ -35,10 +36,10 @@ def stages(progress: Progress) -> list[Stage]:
     plan, config = progress.plan, progress.plan.config
 
     def stage[T](
-        name: str, title: str, command: Callable[[T], list[str]], of: T, needed: bool = True,
+        name: StageName, title: str, command: Callable[[T], list[str]], of: T, needed: bool = True,
         optional: Callable[[int], bool] = never, fresh: bool = False,
     ) -> list[Stage]:  # fmt: skip
-        folder = plan.out / name if fresh else None
+        folder = plan.folder(name) if fresh else None
         return [Stage(name, title, partial(command, of), optional, folder)] if needed else []
 
     def leaves_policies(status: int) -> bool:
@@ -51,31 +52,36 @@ def stages(progress: Progress) -> list[Stage]:
 
     records, clones = config.rollouts > 0, plan.clones
     return [
-        *stage("columns", "Leave out columns that rollouts lack", columns, plan, bool(plan.extra_columns),
-               fresh=True),
-        *stage("rollouts", "Record rollouts of the policy", rollouts, plan, records),
-        *stage("merged", "Merge the dataset with them", merged, plan, records, fresh=True),
-        *stage("cloned", "Train the policy further on the successes", cloned, progress, clones, fresh=True),
-        *stage("tokenizer", "Train the frame tokenizer", tokenizer, plan),
-        *stage("world_model", "Train the world model", world_model, plan),
-        *stage("check", "Check the world model on recorded episodes", check, progress),
-        *stage("start", "Choose in imagination which policy to improve", start, progress, clones),
-        *stage("rl", "Train the policy in imagination", rl, progress, optional=leaves_policies),
-        *stage("distilled", "Fit the policy to a planner in imagination", distilled, progress, config.distils,
-               optional=lambda status: can_compare()),
-        *stage("choice", "Choose the policy to use", choice, progress, config.selects),
-        *stage("comparison", "Compare the policies", comparison, progress),
+        *stage(StageName.COLUMNS, "Leave out columns that rollouts lack", columns_command, plan,
+               bool(plan.extra_columns), fresh=True),
+        *stage(StageName.ROLLOUTS, "Record rollouts of the policy", rollouts_command, plan, records),
+        *stage(StageName.MERGED, "Merge the dataset with them", merged_command, plan, records, fresh=True),
+        *stage(StageName.CLONED, "Train the policy further on the successes", cloned_command, progress,
+               clones, fresh=True),
+        *stage(StageName.TOKENIZER, "Train the frame tokenizer", tokenizer_command, plan),
+        *stage(StageName.WORLD_MODEL, "Train the world model", world_model_command, plan),
+        *stage(StageName.CHECK, "Check the world model on recorded episodes", check_command, progress),
+        *stage(StageName.START, "Choose in imagination which policy to improve", start_command, progress,
+               clones),
+        *stage(StageName.RL, "Train the policy in imagination", rl_command, progress,
+               optional=leaves_policies),
+        *stage(StageName.DISTILLED, "Fit the policy to a planner in imagination", distilled_command, progress,
+               config.distils, optional=lambda status: can_compare()),
+        *stage(StageName.CHOICE, "Choose the policy to use", choice_command, progress, config.selects),
+        *stage(StageName.COMPARISON, "Compare the policies", comparison_command, progress),
     ]  # fmt: skip
 
 
-def columns(plan: Plan) -> list[str]:
+def columns_command(plan: Plan) -> list[str]:
+    """Return the command that leaves out the columns that rollouts lack."""
     root = plan.findings.root
-    return edit_command(plan.out / "columns", "remove_feature", {
+    return edit_command(plan.folder(StageName.COLUMNS), "remove_feature", {
         "repo_id": f"local/{root.name}", "root": str(root), "operation.feature_names": plan.extra_columns,
     })  # fmt: skip
 
 
-def rollouts(plan: Plan) -> list[str]:
+def rollouts_command(plan: Plan) -> list[str]:
+    """Return the command that records rollouts of the policy in the real environment."""
     config = plan.config
     like: Flags = {"like.root": str(plan.mergeable), "max_frames": plan.frame_limit}
     env = {name: value for name, value in real_env(plan, "env").items() if name != "env.batched"}
@@ -84,23 +90,25 @@ def rollouts(plan: Plan) -> list[str]:
         **({} if plan.in_maniskill else like),
         "video": "video" in plan.findings.columns.values(), "num_episodes": config.rollouts,
         "exploration": config.exploration, "seed": config.seed + ROLLOUT_SEED_OFFSET,
-        "output_dir": str(plan.out / "rollouts"),
+        "output_dir": str(plan.folder(StageName.ROLLOUTS)),
     })]  # fmt: skip
 
 
-def merged(plan: Plan) -> list[str]:
-    parts = {"dataset": plan.mergeable, "rollouts": plan.out / "rollouts"}
-    return merge_command(plan.out / "merged", parts)
+def merged_command(plan: Plan) -> list[str]:
+    """Return the command that merges the dataset with the rollouts."""
+    parts = {"dataset": plan.mergeable, "rollouts": plan.folder(StageName.ROLLOUTS)}
+    return merge_command(plan.folder(StageName.MERGED), parts)
 
 
-def cloned(progress: Progress) -> list[str]:
+def cloned_command(progress: Progress) -> list[str]:
+    """Return the command that trains the policy further on the successful episodes."""
     plan = progress.plan
     policy, table = plan.config.policy, progress.learnt.table
     assert policy is not None
     successes = np.flatnonzero(table.success & table.among(plan.data.episodes)).tolist()
     # LeRobot keeps loaded adapters, but writes no policy's configuration beside them without the flag
     adapters: Flags = {"peft.method_type": "LORA"} if policy.use_peft else {}
-    return train_command(plan.out / "cloned", [
+    return train_command(plan.folder(StageName.CLONED), [
         *format_lerobot_flags(plan.sizes.cloning_settings()),
         *format_lerobot_flags({
             "policy.path": plan.policy, "policy.push_to_hub": False, **adapters,
@@ -111,48 +119,53 @@ def cloned(progress: Progress) -> list[str]:
     ])  # fmt: skip
 
 
-def tokenizer(plan: Plan) -> list[str]:
-    return world_model_command(plan, "frame_tokenizer", "tokenizer", {
+def tokenizer_command(plan: Plan) -> list[str]:
+    """Return the command that trains the frame tokenizer."""
+    return model_command(plan, "frame_tokenizer", StageName.TOKENIZER, {
         "model.tokenizer.cameras": plan.findings.cameras,
         "model.tokenizer.image_size": plan.sizes.side, "model.tokenizer.context": True,
         "model.tokenizer.success": True,
     })  # fmt: skip
 
 
-def world_model(plan: Plan) -> list[str]:
-    return world_model_command(plan, "action_world_model", "world_model", {
-        "model.tokenizer_path": str(plan.out / "tokenizer"),
+def world_model_command(plan: Plan) -> list[str]:
+    """Return the command that trains the action world model."""
+    return model_command(plan, "action_world_model", StageName.WORLD_MODEL, {
+        "model.tokenizer_path": str(plan.folder(StageName.TOKENIZER)),
         "model.clip_length": plan.length + 2,
     })  # fmt: skip
 
 
-def world_model_command(plan: Plan, model: str, folder: str, flags: Flags) -> list[str]:
+def model_command(plan: Plan, model: str, stage: StageName, flags: Flags) -> list[str]:
     """Return the command that trains a tokenizer or a world model."""
     return sized_command(plan, "lerobot-wmrl-train-world-model", {
         "model.type": model, **flags, **plan.data.flags(), "seed": plan.config.seed,
-        "output_dir": str(plan.out / folder),
+        "output_dir": str(plan.folder(stage)),
     })  # fmt: skip
 
 
-def check(progress: Progress) -> list[str]:
+def check_command(progress: Progress) -> list[str]:
+    """Return the command that replays recorded episodes in the world model."""
     plan = progress.plan
     data, split = progress.learnt.checked()
     # imagination that also begins in the middle of episodes reaches their ends
     length: Flags = {} if progress.learnt.branches() else {"episode_length": plan.length}
     return ["lerobot-wmrl-eval-world-model", *format_flags({
-        "model.path": str(plan.out / "world_model"), **data, "split": split, **length,
-        **plan.strict_criterion(), "max_episodes": 200, "output_dir": str(plan.out / "check"),
+        "model.path": str(plan.folder(StageName.WORLD_MODEL)), **data, "split": split, **length,
+        **plan.strict_criterion(), "max_episodes": 200, "output_dir": str(plan.folder(StageName.CHECK)),
     })]  # fmt: skip
 
 
-def start(progress: Progress) -> list[str]:
+def start_command(progress: Progress) -> list[str]:
+    """Return the command that compares the cloned policy with the one before, in imagination."""
     plan = progress.plan
     both = [progress.policies[CLONED], plan.policy]
-    folder, seed = plan.out / "start", plan.config.seed
-    return compare(progress, folder, imagination(progress), IMAGINED_STARTS, both, seed)
+    folder, seed = plan.folder(StageName.START), plan.config.seed
+    return compare_command(progress, folder, imagination(progress), IMAGINED_STARTS, both, seed)
 
 
-def rl(progress: Progress) -> list[str]:
+def rl_command(progress: Progress) -> list[str]:
+    """Return the command that trains the better of the two in imagination."""
     plan, config = progress.plan, progress.plan.config
     real: Flags = {} if config.real_env is None else real_env(plan, "real_env")
     iterations: Flags = {} if config.iterations is None else {"iterations": config.iterations}
@@ -165,44 +178,47 @@ def rl(progress: Progress) -> list[str]:
         "selection.freq": ceil(plan.sizes.iterations(algorithm) / SELECTIONS),
         "selection.n_episodes": plan.rl_selection_episodes,
     }
-    return train(progress, "rl", progress.policies[progress.start()], {
+    return train_policy_command(progress, StageName.RL, progress.policies[progress.start()], {
         **real, "gate.action": "warn" if real else "off", "gate.freq": 0,
         "gate.n_episodes": min(50, config.eval_episodes),
         **(selection if config.selects else {}), **algorithm,
     })  # fmt: skip
 
 
-def distilled(progress: Progress) -> list[str]:
-    return train(progress, "distilled", progress.distillation_start(), {
+def distilled_command(progress: Progress) -> list[str]:
+    """Return the command that fits the policy to a planner in imagination."""
+    return train_policy_command(progress, StageName.DISTILLED, progress.distillation_start(), {
         "gate.action": "off", "algorithm.type": "distillation", "algorithm.recorded": False,
     })  # fmt: skip
 
 
-def train(progress: Progress, folder: str, policy: str, flags: Flags) -> list[str]:
+def train_policy_command(progress: Progress, stage: StageName, policy: str, flags: Flags) -> list[str]:
     """Return the command that trains a policy in imagination."""
     plan = progress.plan
     fitting = plan.sizes.rl_flags(flags, progress.learnt.success_frames)
     return sized_command(plan, "lerobot-wmrl-train", {
         "policy.path": policy, **imagination(progress), **fitting, **flags,
-        "seed": plan.config.seed, "output_dir": str(plan.out / folder),
+        "seed": plan.config.seed, "output_dir": str(plan.folder(stage)),
     })  # fmt: skip
 
 
-def choice(progress: Progress) -> list[str]:
+def choice_command(progress: Progress) -> list[str]:
+    """Return the command that compares all policies on starts for selection, to choose one."""
     plan = progress.plan
-    folder, starts = plan.out / "choice", plan.config.selection_episodes
+    folder, starts = plan.folder(StageName.CHOICE), plan.config.selection_episodes
     seed = SELECTION_SEED + plan.rl_selection_episodes
-    return compare(progress, folder, real_env(plan, "env"), starts, seed=seed)
+    return compare_command(progress, folder, real_env(plan, "env"), starts, seed=seed)
 
 
-def comparison(progress: Progress) -> list[str]:
+def comparison_command(progress: Progress) -> list[str]:
+    """Return the command that compares all policies on starts for evaluation, to report them."""
     plan = progress.plan
     imagined = plan.config.real_env is None
     env = imagination(progress) if imagined else real_env(plan, "env")
-    return compare(progress, plan.out / "comparison", env, plan.config.eval_episodes)
+    return compare_command(progress, plan.folder(StageName.COMPARISON), env, plan.config.eval_episodes)
 
 
-def compare(
+def compare_command(
     progress: Progress, folder: Path, env: Flags, starts: int, policies: Sequence[str] = (),
     seed: int = EVALUATION_SEED,
 ) -> list[str]:  # fmt: skip
@@ -223,7 +239,7 @@ def imagination(progress: Progress) -> Flags:
     """Return the environment that the world model makes."""
     plan = progress.plan
     return {
-        "env.type": "world_model", "env.world_model_path": str(plan.out / "world_model"),
+        "env.type": "world_model", "env.world_model_path": str(plan.folder(StageName.WORLD_MODEL)),
         **{f"env.{name}": value for name, value in plan.data.flags().items()},
         "env.dataset.max_starts": MAX_STARTS, "env.dataset.branches": progress.learnt.branches(),
         "env.reward.type": "general", "env.reward.alpha": 1, "env.episode_length": plan.length,
@@ -242,7 +258,7 @@ def sized_command(plan: Plan, program: str, flags: Flags) -> list[str]:
     return [program, f"--preset={plan.config.preset}", *format_flags(flags)]
 
 
-def drive(progress: Progress) -> list[str]:
+def drive_command(progress: Progress) -> list[str]:
     """Return the command that shows the world model and the policy to use in the browser; of several tasks it
     opens the first."""
     plan, env = progress.plan, progress.plan.config.real_env
@@ -250,12 +266,12 @@ def drive(progress: Progress) -> list[str]:
         env = replace(env, task=env.task_names[0])
     real = {} if env is None else env_flags(env, "real_env")
     return ["lerobot-wmrl-play", *format_flags({
-        "world_model.path": str(plan.out / "world_model"), **plan.data.flags(),
+        "world_model.path": str(plan.folder(StageName.WORLD_MODEL)), **plan.data.flags(),
         "policy.path": progress.policies[progress.chosen()], **real, **progress.criterion(),
     })]  # fmt: skip
 
 
-def another_round(progress: Progress) -> list[str] | None:
+def another_round_command(progress: Progress) -> list[str] | None:
     """Return the command that records rollouts of the policy to use and improves it on all episodes; None if
     nothing was recorded."""
     plan, config = progress.plan, progress.plan.config

@@ -10,9 +10,9 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice, require_share
+from lerobot_wmrl.common.flags import Flags
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.policy_checks import require_chunks, require_distillable, require_trained
-from lerobot_wmrl.common.presets import Flags
 from lerobot_wmrl.common.seeds import EVALUATION_SEED, require_seed
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from lerobot_wmrl.common.constants import START_TASK
-from lerobot_wmrl.common.presets import Flags
+from lerobot_wmrl.common.flags import Flags
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.start_frames import chosen_episodes

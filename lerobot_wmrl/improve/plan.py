@@ -12,9 +12,9 @@ from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD
 
 from lerobot_wmrl.common.checkpoints import best_model, last_model, resolved_path
 from lerobot_wmrl.common.constants import START_KIND, START_SEED
+from lerobot_wmrl.common.flags import Flags
 from lerobot_wmrl.common.policies import copy_checkpoint, load_processors
 from lerobot_wmrl.common.policy_checks import check_units
-from lerobot_wmrl.common.presets import Flags
 from lerobot_wmrl.common.stages import in_fork
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment
@@ -25,6 +25,7 @@ from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, inspect_dataset, require_mergeable
 from lerobot_wmrl.improve.own_cameras import with_own_cameras, without_renaming
 from lerobot_wmrl.improve.sizes import Sizes
+from lerobot_wmrl.improve.stage_names import StageName
 from lerobot_wmrl.maniskill.recordings import require_unreported
 from lerobot_wmrl.rewards.general import default_discount
 
@@ -131,10 +132,14 @@ class Plan:
         """Whether a policy is cloned from the successes alone. If all episodes succeed, this one was."""
         return bool(self.config.rollouts or self.findings.failures)
 
+    def folder(self, stage: StageName) -> Path:
+        """Return the folder that a stage fills."""
+        return self.out / stage
+
     @property
     def rl_checkpoint(self) -> Path:
         """RL's checkpoint: the best one with selection, else the last. It exists too if RL stopped early."""
-        folder = self.out / "rl"
+        folder = self.folder(StageName.RL)
         return best_model(folder) if self.config.selects else last_model(folder)
 
     @property
@@ -156,7 +161,7 @@ class Plan:
     @property
     def mergeable(self) -> Path:
         """Folder of the dataset with the columns that rollouts have too."""
-        return self.out / "columns" if self.extra_columns else self.findings.root
+        return self.folder(StageName.COLUMNS) if self.extra_columns else self.findings.root
 
     @property
     def data(self) -> ChosenEpisodes:
@@ -167,7 +172,7 @@ class Plan:
         chosen = dataset.episodes
         if chosen is not None:
             chosen = [*chosen, *self.rollout_numbers()]
-        return ChosenEpisodes(root=str(self.out / "merged"), episodes=chosen)
+        return ChosenEpisodes(root=str(self.folder(StageName.MERGED)), episodes=chosen)
 
     def rollout_numbers(self) -> range:
         """Return the numbers of the rollouts among the merged episodes."""

@@ -8,11 +8,12 @@ from typing import Any, Final
 
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE, Comparison, episodes_from_json
+from lerobot_wmrl.improve.stage_names import StageName
 from lerobot_wmrl.rl.callbacks import RECORD_FILE, Record
 from lerobot_wmrl.rl.gate_callback import SuccessGate
 from lerobot_wmrl.rl.selection import Selection
 
-CHECK: Final = "check/metrics.json"
+CHECK: Final = f"{StageName.CHECK}/metrics.json"
 """What the world model says of recorded episodes."""
 
 
@@ -49,14 +50,14 @@ def read_check(out: Path) -> dict[str, Any]:
 
 def read_gate(out: Path) -> dict[str, Any] | None:
     """Read what the gate found before RL; None if there was none."""
-    records = sorted((out / "rl" / SuccessGate.name).glob(f"*/{RECORD_FILE}"))
+    records = sorted((out / StageName.RL / SuccessGate.name).glob(f"*/{RECORD_FILE}"))
     return read_json(records[-1]) if records else None
 
 
 def read_selection(out: Path) -> dict[int, Record]:
     """Read how successful RL's checkpoints were in the real environment, by iteration; nothing without
     selection."""
-    folders = (out / "rl" / Selection.name).glob(f"*/{RECORD_FILE}")
+    folders = (out / StageName.RL / Selection.name).glob(f"*/{RECORD_FILE}")
     return {int(path.parent.name): read_json(path) for path in folders}
 
 

@@ -4,7 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from lerobot_wmrl.common.presets import Flags, preset_settings
+from lerobot_wmrl.common.flags import Flags
+from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 

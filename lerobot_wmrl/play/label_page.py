@@ -15,6 +15,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.images import jpeg, to_pixels
+from lerobot_wmrl.data.dataset import fingerprint
 from lerobot_wmrl.play.checks import whole_number
 from lerobot_wmrl.play.web import Access
 from lerobot_wmrl.rewards.success_rules import frame_positions
@@ -36,13 +37,14 @@ class LabelPage:
         dataset: dataset whose episodes are labelled.
 
     Raises:
-        FieldError: the file holds the labels of another dataset.
+        FieldError: the file holds the labels of another dataset, or one that cannot be.
     """
 
     def __init__(self, file: Path, last: int, host: str, dataset: LeRobotDataset) -> None:
         self.file, self.last, self.dataset, self.access = file, last, dataset, Access(host)
         self.lengths = [int(row["length"]) for row in dataset.meta.episodes]
-        self.about = {"dataset": str(Path(dataset.root).resolve()), "lengths": self.lengths}
+        root = Path(dataset.root)
+        self.about = {"dataset": str(root.resolve()), "content": fingerprint(root), "lengths": self.lengths}
         self.labels = self._read()
         self.done = asyncio.Event()
         self.worker = ThreadPoolExecutor(1, "frames")
@@ -75,14 +77,16 @@ class LabelPage:
         Raises:
             FieldError: there is no such episode or frame.
         """
-        index = whole_number("episode", episode, len(self.lengths) - 1)
         if first == "none":
-            self.labels.pop(index, None)
-        elif first is None:
-            self.labels[index] = None
+            self.labels.pop(whole_number("episode", episode, len(self.lengths) - 1), None)
         else:
-            self.labels[index] = whole_number("first", first, self.lengths[index] - 1)
+            self.labels |= self._checked(episode, first)
         write_json(self.file, {**self.about, "labels": self.labels})
+
+    def _checked(self, episode: Any, first: Any) -> Labels:
+        """Return the label of one episode. FieldError if there is no such episode or frame."""
+        index = whole_number("episode", episode, len(self.lengths) - 1)
+        return {index: None if first is None else whole_number("first", first, self.lengths[index] - 1)}
 
     async def _describe(self, request: web.Request) -> web.Response:
         tasks = [", ".join(row["tasks"]) for row in self.dataset.meta.episodes]
@@ -137,15 +141,24 @@ class LabelPage:
             return {}
         try:
             stored = json.loads(self.file.read_text())
-            labels = {int(episode): first for episode, first in stored["labels"].items()}
-            same = {name: stored[name] for name in self.about} == self.about
+            given = {int(episode): first for episode, first in stored["labels"].items()}
+            same = {name: stored.get(name) for name in self.about} == self.about
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise FieldError("file", self.file, "holds no labels", "choose another file") from error
         if not same:
             raise FieldError(
-                "file", self.file, f"holds the labels of {stored['dataset']}, as it was then",
+                "file", self.file, f"holds the labels of {stored.get('dataset')}, as it was then",
                 "choose another file",
             )  # fmt: skip
+        labels: Labels = {}
+        for episode, first in given.items():
+            try:
+                labels |= self._checked(episode, first)
+            except FieldError as error:
+                raise FieldError(
+                    "file", self.file, f"the label {episode}: {json.dumps(first)} cannot be ({error})",
+                    "correct it there, or take it out",
+                ) from error  # fmt: skip
         return labels
 
 

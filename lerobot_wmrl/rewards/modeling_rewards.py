@@ -59,7 +59,7 @@ class ProxyRewardModel(HubCard, PreTrainedRewardModel):
         super().__init__(config)
         self.config: ProxyConfig = config
         if dataset_meta is not None:
-            self._read_image_size(dataset_meta.features)
+            self._read_image_size(dataset_meta)
         require_at_least(config, 8, "image_size")
         width, last, side = config.width, 2 * config.width, -(-config.image_size // 8)
         self.layers = nn.Sequential(
@@ -69,11 +69,12 @@ class ProxyRewardModel(HubCard, PreTrainedRewardModel):
             nn.Flatten(), nn.Linear(last * side**2, config.hidden), nn.ReLU(), nn.Linear(config.hidden, 1),
         )  # fmt: skip
 
-    def _read_image_size(self, features: dict[str, Any]) -> None:
+    def _read_image_size(self, meta: Any) -> None:
+        features = meta.features
         first = self.config.camera_keys[0]
         if not self.config.image_size and first in features:
             self.config.image_size = frame_size(features[first])[0]
-        check_cameras(features, self.config.camera_keys, "cameras")
+        check_cameras(meta, self.config.camera_keys, "cameras")
 
     def check_world_model(self, model: ActionWorldModelRewardModel) -> None:
         """Raise FieldError unless the model imagines frames like those that the network was trained on."""

@@ -1,12 +1,13 @@
 """What counts as success in a dataset that does not say so. N frames, E episodes."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from draccus import ChoiceRegistry
 
+from lerobot_wmrl.common.constants import DONE_FRAMES
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ class FirstFramesRule(SuccessRule):
             Episodes that are not named fail: all of them with `{}`.
     """
 
-    first: dict[int, int] | None = None
+    first: dict[str, float | None] | None = None  # so that draccus leaves it to `whole_numbers` what is none
 
     def labels(self, dataset: "LeRobotDataset") -> np.ndarray:
         episode, *_ = frame_positions(dataset)
@@ -71,14 +72,10 @@ class FirstFramesRule(SuccessRule):
             raise FieldError(
                 "first", None, "names no episode that succeeds", "name those that do, or {} if none does"
             )
-        if None in self.first.values():  # YAML reads `1:45` as one number of base 60
-            raise FieldError(
-                "first", self.first, "does not say from which frame on an episode is solved",
-                "write a space after each colon: {0: 120, 3: 95}",
-            )  # fmt: skip
-        require_episodes("first", self.first, dataset)
+        numbers = whole_numbers("first", self.first)
+        require_episodes("first", numbers, dataset)
         solved = np.zeros(len(episode), bool)
-        for index, first in self.first.items():
+        for index, first in numbers.items():
             begin, end = np.searchsorted(episode, (index, index + 1))
             if not 0 <= first < end - begin:
                 raise FieldError(
@@ -141,6 +138,22 @@ class RewardModelRule(SuccessRule):
         return reach(frame_rewards(self.path, self.device, dataset), self.threshold)
 
 
+def whole_numbers(name: str, pairs: Mapping[str, float | None]) -> dict[int, int]:
+    """Return episodes and frames as whole numbers. FieldError names a pair that is not of two."""
+    if None in pairs.values():  # YAML reads `0:45` as a text or one number of base 60
+        raise FieldError(
+            name, pairs, "does not say from which frame on an episode is solved",
+            "write a space after each colon: {0: 120, 3: 95}",
+        )  # fmt: skip
+    for episode, frame in pairs.items():
+        if not (str(episode).lstrip("-").isdecimal() and float(frame or 0).is_integer()):
+            raise FieldError(
+                name, pairs, f"{episode}: {frame} is not an episode and a frame",
+                "give whole numbers: {0: 120, 3: 95}",
+            )  # fmt: skip
+    return {int(episode): int(frame or 0) for episode, frame in pairs.items()}
+
+
 def frame_positions(dataset: "LeRobotDataset") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return each frame's episode, its place in it, and the episode's length, (N,) each."""
     rows = dataset.hf_dataset.with_format("numpy", columns=["episode_index", "frame_index"])[:]
@@ -158,6 +171,32 @@ def next_frame_solved(solved: np.ndarray, dataset: "LeRobotDataset") -> np.ndarr
     """
     _, frame, length = frame_positions(dataset)
     return np.where(frame == length - 1, solved, np.roll(solved, -1))
+
+
+def longest_run(success: np.ndarray) -> int:
+    """Return the largest number of successes in a row. (T,)"""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], success, [False]])))
+    return int(np.diff(ends)[::2].max(initial=0))
+
+
+def duration_lines(runs: Sequence[int]) -> list[str]:
+    """Say how long success holds, and with which flags it counts where that is too short.
+
+    runs: the most frames in a row in which the task is solved, of each episode.
+    """
+    held = np.array([count for count in runs if count])
+    if not len(held):
+        return []
+    lines = [
+        f"Success holds for {held.min()} to {held.max()} frames in a row (median {np.median(held):.0f})."
+    ]
+    if held.min() < DONE_FRAMES:
+        short = int((held < DONE_FRAMES).sum())
+        lines.append(
+            f"{short} of them for fewer than {DONE_FRAMES}: these count with --env.done_frames={held.min()} "
+            f"in lerobot-wmrl-train and --done_frames={held.min()} in lerobot-wmrl-eval-world-model."
+        )
+    return lines
 
 
 def require_episodes(name: str, episodes: Collection[int], dataset: "LeRobotDataset") -> None:

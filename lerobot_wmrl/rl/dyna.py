@@ -14,8 +14,8 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.constants import DYNA
 from lerobot_wmrl.common.errors import TrainingStopped
+from lerobot_wmrl.common.flags import Flags, format_flags
 from lerobot_wmrl.common.precision import device_setting
-from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.common.seeds import dyna_seed
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset

@@ -10,9 +10,8 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from tqdm import trange
 
-from lerobot_wmrl.common.lerobot_commands import env_flags
+from lerobot_wmrl.common.flags import Flags, env_flags, format_flags
 from lerobot_wmrl.common.policies import read_policy_config
-from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.embodiment import Embodiment

@@ -10,9 +10,8 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.checkpoints import best_model, last_model
 from lerobot_wmrl.common.errors import within
+from lerobot_wmrl.common.flags import env_flags, format_lerobot_flags
 from lerobot_wmrl.common.hub import create_repo, published_name, publishing
-from lerobot_wmrl.common.lerobot_commands import env_flags
-from lerobot_wmrl.common.presets import format_lerobot_flags
 from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.rl.callbacks import read_record

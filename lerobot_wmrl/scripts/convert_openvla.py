@@ -17,7 +17,7 @@ from pathlib import Path
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, renamed, require_choice
 from lerobot_wmrl.common.files import require_new, whole_folder, writing
-from lerobot_wmrl.common.presets import flag_as_typed
+from lerobot_wmrl.common.flags import flag_as_typed
 
 DIRECTIONS = ("import", "export")
 

@@ -30,10 +30,11 @@ from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.constants import DONE_FRAMES, DONE_THRESHOLD, START_SCENE
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_probability
 from lerobot_wmrl.common.files import write_json, write_text
+from lerobot_wmrl.common.flags import flag_as_typed
 from lerobot_wmrl.common.hub import check_login
 from lerobot_wmrl.common.output_folders import Claim
 from lerobot_wmrl.common.policies import LoadedPolicy
-from lerobot_wmrl.common.presets import expand_preset, flag_as_typed
+from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.dataset import ChosenEpisodes

@@ -48,7 +48,7 @@ def improve(cfg: ImproveConfig) -> None:
         page = Page.of(progress)
         path = page.write(cfg.output_dir)
     print(f"\n{verdict(progress, page.places)}\n\nThe report: {path}")
-    if again := commands.another_round(progress):
+    if again := commands.another_round_command(progress):
         print(f"Another round, with as many rollouts of this policy:\n{shlex.join(again)}")
 
 

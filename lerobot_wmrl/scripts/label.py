@@ -24,15 +24,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
-from lerobot_wmrl.common.constants import DONE_FRAMES
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import require_new, whole_folder, writing
+from lerobot_wmrl.common.flags import flag_as_typed
 from lerobot_wmrl.common.lerobot_commands import edit_advice
-from lerobot_wmrl.common.presets import flag_as_typed
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import SUCCESS
 from lerobot_wmrl.play import labels  # noqa: F401 (registers `by_hand`)
-from lerobot_wmrl.rewards.success_rules import ColumnRule, EndsRule, SuccessRule, frame_positions
+from lerobot_wmrl.rewards.success_rules import (
+    ColumnRule,
+    EndsRule,
+    SuccessRule,
+    duration_lines,
+    frame_positions,
+    longest_run,
+)
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -97,12 +103,6 @@ def write_labelled(dataset: "LeRobotDataset", success: np.ndarray, output_dir: P
         add_features(dataset, column, output_dir=partial, repo_id=repo_id)
 
 
-def longest_run(success: np.ndarray) -> int:
-    """Return the largest number of successes in a row. (T,)"""
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], success, [False]])))
-    return int(np.diff(ends)[::2].max(initial=0))
-
-
 def report(runs: Sequence[int], cfg: LabelConfig) -> list[str]:
     """Return what the labels say, and what cannot be learnt from them.
 
@@ -113,16 +113,7 @@ def report(runs: Sequence[int], cfg: LabelConfig) -> list[str]:
     held = np.array([count for count in runs if count])
     failures = len(runs) - len(held)
     lines = [f"{cfg.output_dir}: {len(runs)} episodes, of which {len(held)} succeed and {failures} fail."]
-    if len(held):
-        lines.append(
-            f"Success holds for {held.min()} to {held.max()} frames in a row (median {np.median(held):.0f})."
-        )
-    if len(held) > 0 and held.min() < DONE_FRAMES:
-        short = int((held < DONE_FRAMES).sum())
-        lines.append(
-            f"{short} of them for fewer than {DONE_FRAMES}: these count with --env.done_frames={held.min()} "
-            f"in lerobot-wmrl-train and --done_frames={held.min()} in lerobot-wmrl-eval-world-model."
-        )
+    lines += duration_lines(runs)
     if isinstance(cfg.success, EndsRule) and cfg.success.episodes is None:
         lines.append(
             "Every episode was taken for a success. If some fail, label the dataset again, with "

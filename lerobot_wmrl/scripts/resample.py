@@ -22,14 +22,15 @@ from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, REWARD
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.files import require_new, whole_folder, writing
+from lerobot_wmrl.common.flags import flag_as_typed
 from lerobot_wmrl.common.lerobot_commands import edit_advice
-from lerobot_wmrl.common.presets import flag_as_typed
-from lerobot_wmrl.data.dataset import DatasetSource, save_episode
+from lerobot_wmrl.data.dataset import DatasetSource, open_dataset, save_episode
 from lerobot_wmrl.data.decoding import decode, row_parts, rows_of
 from lerobot_wmrl.data.embodiment import component_names
 from lerobot_wmrl.data.episodes import SUCCESS_COLUMNS, read_episodes
 from lerobot_wmrl.data.features import encoder_of
 from lerobot_wmrl.evaluation.accuracy import absolute_control
+from lerobot_wmrl.rewards.success_rules import duration_lines, longest_run
 
 AFTER: Final = "next."
 """How the names of columns begin that say what came after a frame's action."""
@@ -68,12 +69,15 @@ def resample(cfg: ResampleConfig) -> None:
         )
     with writing("output_dir", cfg.output_dir, resumes=False):
         write_resampled(dataset, cfg, summed)
-    frames = sum(-(-int(length) // cfg.every) for length in table.length)
-    print(
-        f"{cfg.output_dir}: {len(table.length)} episodes, {frames} frames at {dataset.fps // cfg.every} Hz, "
-        f"the longest has {-(-int(table.length.max()) // cfg.every)}.\n"
-        f"Next: lerobot-train {flag_as_typed('dataset.root', cfg.output_dir)} …"
-    )
+    copied = read_episodes(open_dataset(cfg.output_dir))
+    success = [copied.done[rows] for rows in copied.rows(range(len(copied.start)))]
+    lines = [
+        f"{cfg.output_dir}: {len(copied.length)} episodes, {copied.length.sum()} frames at "
+        f"{copied.dataset.fps} Hz, the longest has {copied.length.max()}.",
+        *duration_lines([longest_run(each) for each in success]),
+        f"Next: lerobot-train {flag_as_typed('dataset.root', cfg.output_dir)} …",
+    ]
+    print("\n".join(lines))
 
 
 def summed_components(cfg: ResampleConfig, dataset: LeRobotDataset) -> np.ndarray:

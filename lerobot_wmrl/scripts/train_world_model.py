@@ -30,9 +30,10 @@ from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process, process_seed
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_choice, within
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.flags import format_flags
 from lerobot_wmrl.common.output_folders import RUN_CONFIG_FILE, Claim
 from lerobot_wmrl.common.precision import PRECISIONS, keep_freed_memory, training_dtype
-from lerobot_wmrl.common.presets import expand_preset, format_flags
+from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.common.tracking import make_wandb, read_metrics
 from lerobot_wmrl.data.dataset import TrainingData, fingerprint
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes

@@ -226,13 +226,13 @@ def check_dataset(config: FrameTokenizerConfig | WorldModelConfig, meta: Any) ->
     """
     features = meta.features
     tokenizer_config = config.trained_tokenizer if isinstance(config, WorldModelConfig) else config.tokenizer
-    check_cameras(features, tokenizer_config.camera_keys)
+    check_cameras(meta, tokenizer_config.camera_keys)
     if isinstance(config, WorldModelConfig):
         if config.depth:
             check_depth(features, tokenizer_config.camera_keys)
-        check_widths(features, {OBS_STATE: config.state_size})
+        check_widths(meta, {OBS_STATE: config.state_size})
     if isinstance(config, ActionWorldModelConfig):
-        check_widths(features, {ACTION: config.action_size})
+        check_widths(meta, {ACTION: config.action_size})
         check_same_robot(config.embodiment, meta)
 
 

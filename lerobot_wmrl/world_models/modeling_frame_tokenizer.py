@@ -93,7 +93,7 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
 
     def __init__(self, config: FrameTokenizerConfig, dataset_meta: Any = None, **kwargs: Any) -> None:
         if dataset_meta is not None:
-            check_cameras(dataset_meta.features, config.tokenizer.camera_keys, "tokenizer.cameras")
+            check_cameras(dataset_meta, config.tokenizer.camera_keys, "tokenizer.cameras")
             sized = with_frame_sizes(config.tokenizer, dataset_meta.features)
             config = replace(config, tokenizer=sized)
         super().__init__(config)

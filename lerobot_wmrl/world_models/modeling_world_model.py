@@ -95,7 +95,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         self.config: Any = config
         check_tokenizer_source(config, dataset_meta is not None and not config.pretrained_path)
         if dataset_meta is not None:
-            check_episode_lengths(dataset_meta)
+            check_episode_lengths(dataset_meta.root, dataset_meta.total_episodes, dataset_meta.total_frames)
         source = self._adopt_tokenizer() if config.tokenizer_path else None
         self._unmeasured: list[float] = []  # known with the dataset
         if dataset_meta is not None:
@@ -141,7 +141,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         if self.config.pretrained_path:
             check_dataset(self.config, meta)
         tokenizer_config, features = self.config.tokenizer, meta.features
-        check_cameras(features, tokenizer_config.camera_keys)
+        check_cameras(meta, tokenizer_config.camera_keys)
         self.config.tokenizer = with_frame_sizes(tokenizer_config, features)
         if self.config.depth:
             check_depth(features, tokenizer_config.camera_keys)

@@ -11,7 +11,7 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 
 from lerobot_wmrl.common.constants import HUMAN_LIKE, KINDS, START_KIND
 from lerobot_wmrl.common.errors import FieldError, renamed
-from lerobot_wmrl.data.checks import require_shown, solved_from_the_start
+from lerobot_wmrl.data.checks import check_episode_lengths, require_shown, solved_from_the_start
 from lerobot_wmrl.data.clips import ClipSampler, FrameSampler, InTurn
 from lerobot_wmrl.data.dataset import TrainingData
 from lerobot_wmrl.data.episodes import EpisodeTable, count_tasks
@@ -109,31 +109,44 @@ def make_sampler(
     if isinstance(config, TextWorldModelConfig):
         golden = golden_episodes(table)
         episodes, measured = require_golden(table, episodes & golden), measured & golden
-    measured = measured.nonzero()[0]
-    frames.fill(table.row_numbers(measured))
-    if model.name == "frame_tokenizer":
-        if config.tokenizer.success and not table.has_labels:
-            raise FieldError(
-                "tokenizer.success", True,
-                f"{table.dataset.root} has neither next.success nor next.done, so its frames cannot be told "
-                "apart", "label its episodes, or leave `tokenizer.success` out",
-            )  # fmt: skip
-        if config.tokenizer.success and table.success[episodes].any():
-            require_shown(table, episodes.nonzero()[0])
+    frames.fill(table.row_numbers(measured.nonzero()[0]))
+    if isinstance(config, FrameTokenizerConfig):
+        if config.tokenizer.success:
+            require_success_labels(table, episodes)
         return FrameSampler(
             table, frames, episodes.nonzero()[0], config.tokenizer.cameras, batch_size, seed, config.device
         )
-    require_readable_instructions(model, table.subset(measured))
-    if config.depth:
-        depth = cached_depth(table.dataset, config.tokenizer.camera_keys, model.tokenizer.grid)
-        depth.fill(table.row_numbers(measured))
-    if not isinstance(config, TextWorldModelConfig) and not table.has_labels:
+    check_episode_lengths(table.dataset.root, int(episodes.sum()), int(table.length[episodes].sum()))
+    require_readable(model, table, measured)
+    if isinstance(config, ActionWorldModelConfig) and not table.has_labels:
         logging.warning(
             "dataset.root=%s: has neither next.success nor next.done: the model cannot learn from it what "
             "success is. Check it afterwards (lerobot-wmrl-eval-world-model)",
             table.dataset.root,
         )
     return make_clip_sampler(model, table, episodes.nonzero()[0], batch_size, seed)
+
+
+def require_success_labels(table: EpisodeTable, episodes: np.ndarray) -> None:
+    """Raise FieldError if a dataset has no labels of success, or no frame of these episodes, a mask (E,),
+    shows the success that its labels tell of."""
+    if not table.has_labels:
+        raise FieldError(
+            "tokenizer.success", True,
+            f"{table.dataset.root} has neither next.success nor next.done, so its frames cannot be told "
+            "apart", "label its episodes, or leave `tokenizer.success` out",
+        )  # fmt: skip
+    if table.success[episodes].any():
+        require_shown(table, episodes.nonzero()[0])
+
+
+def require_readable(model: Any, table: EpisodeTable, episodes: np.ndarray) -> None:
+    """Raise ValueError if a world model cannot read the instruction or the depth of one of these episodes,
+    a mask (E,)."""
+    require_readable_instructions(model, table.subset(episodes))
+    if model.config.depth:
+        depth = cached_depth(table.dataset, model.config.tokenizer.camera_keys, model.tokenizer.grid)
+        depth.fill(table.row_numbers(episodes.nonzero()[0]))
 
 
 def require_readable_instructions(model: Any, table: EpisodeTable) -> None:

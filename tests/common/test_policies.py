@@ -148,6 +148,17 @@ def test_a_policy_whose_actions_are_in_other_units_is_refused(
         check_units(config, pipeline, names, low, high)
 
 
+def test_a_policy_of_targets_is_refused_where_actions_are_displacements(tmp_path: Path) -> None:
+    """Their means may be alike. A component that is constant here may vary where the policy was trained."""
+    config = read_policy_config(str(save_untrained_policy(tmp_path)), [])
+    step = SimpleNamespace(stats={"action": {"mean": torch.zeros(3), "std": torch.tensor([35.0, 43.0, 0.1])}})
+    names, low = ["shoulder", "elbow", "gripper"], torch.tensor([-6.0, -6.0, 0.0])
+    with pytest.raises(ValueError, match=r"shoulder has a standard deviation of 35, in .* between -6 and 6"):
+        check_units(config, SimpleNamespace(steps=[step]), names, low, -low)
+    step.stats["action"]["std"] = torch.tensor([6.0, 10.0, 0.5])
+    check_units(config, SimpleNamespace(steps=[step]), names, low, -low)
+
+
 def test_the_rounded_mean_of_a_constant_component_is_in_its_range(tmp_path: Path) -> None:
     config = read_policy_config(str(save_untrained_policy(tmp_path)), [])
     held = torch.tensor([0.3])

@@ -244,7 +244,7 @@ def test_what_another_command_has_run_meanwhile_is_kept(config, monkeypatch):
         results.write_text(finished)
         return make(*args)
 
-    monkeypatch.setattr(policy_rollouts, "opened", opened)
+    monkeypatch.setattr("lerobot_wmrl.scripts.compare.opened", opened)
     monkeypatch.setattr(policy_rollouts, "run_block", None)
     compare(config)
     assert results_of(config) == whole
@@ -360,8 +360,13 @@ def test_a_world_model_compares_a_policy_with_a_planner(imagination, tmp_path):
     config = CompareConfig(
         policies=[str(policy), str(planner)], env=imagination, n_episodes=7, output_dir=tmp_path / "out"
     )
-    with pytest.raises(ValueError, match=r"n_episodes=7: the world model has 6 start frames .* at most 6"):
-        compare(config)
+    fewer = replace(imagination, dataset=replace(imagination.dataset, max_starts=4))
+    for env, starts, setting in ((imagination, 6, "branches"), (fewer, 4, "max_starts")):
+        message = (
+            rf"n_episodes=7: .* has {starts} start frames .* at most {starts}, .*env\.dataset\.{setting}"
+        )
+        with pytest.raises(ValueError, match=message):
+            compare(replace(config, env=env))
     assert not config.output_dir.exists()
     found = results_of(replace(config, n_episodes=6))
     assert [rate["k"] for rate in found["policies"].values()] == [6, 6]

@@ -16,7 +16,7 @@ from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.evaluation import evidence, policy_rollouts
+from lerobot_wmrl.evaluation import policy_rollouts
 from lerobot_wmrl.evaluation.calibration import Confusion
 from lerobot_wmrl.evaluation.evidence import (
     LabelledRollouts,
@@ -194,14 +194,14 @@ def sizes(monkeypatch) -> list[int]:
         sizes.append(n_envs)
         return opened(env, n_envs, *others)
 
-    monkeypatch.setattr(policy_rollouts, "opened", noted)
+    monkeypatch.setattr("lerobot_wmrl.scripts.judge.opened", noted)
     return sizes
 
 
 @pytest.fixture
 def seeing(monkeypatch) -> None:
     """Let the untrained world model tell successes from failures."""
-    monkeypatch.setattr(evidence, "confusion_of", lambda *_: (GOOD, []))
+    monkeypatch.setattr("lerobot_wmrl.scripts.judge.confusion_of", lambda *_: (GOOD, []))
 
 
 def results_of(config: JudgeConfig) -> dict[str, Any]:
@@ -267,7 +267,7 @@ def test_a_policy_whose_actions_are_not_finite_is_named_and_the_others_are_kept(
 def test_episodes_of_other_rollouts_or_another_world_model_are_not_mixed(config, seeing, monkeypatch):
     judge(config)
     changed = Confusion(Proportion(81, 100), Proportion(20, 100))
-    monkeypatch.setattr(evidence, "confusion_of", lambda *_: (changed, []))
+    monkeypatch.setattr("lerobot_wmrl.scripts.judge.confusion_of", lambda *_: (changed, []))
     with pytest.raises(ValueError, match="has changed since its episodes were imagined"):
         judge(config)
 
@@ -367,6 +367,7 @@ def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
         "dataset": {"root": config.dataset.root, "episodes": [0, 1], "more": [again.root]}
     })  # fmt: skip
     assert learnt_from(str(copy), LabelledRollouts.read(config.dataset)) == 6, "as copies too"
+    (tmp_path / "tokenizer").mkdir()
     write(tmp_path / "tokenizer" / "train_config.json", {"dataset": {"root": config.dataset.root}})
     of_others = {"dataset": {"root": others.root}, "model": {"tokenizer_path": str(tmp_path / "tokenizer")}}
     write(copy / "train_config.json", of_others)
@@ -396,6 +397,24 @@ def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
     assert learnt_from(str(further.parent), LabelledRollouts.read(others)) == 3, "from the first on"
     shutil.rmtree(Path(others.root) / "data")
     assert learnt_from(str(copy), LabelledRollouts.read(again)) == 0, "what is not whole tells nothing"
+
+
+def test_what_was_trained_where_is_known_in_every_folder(config, small_dataset, tmp_path, monkeypatch):
+    """Commands were given paths from the folder they were called in."""
+    work, model = tmp_path / "work", tmp_path / "work" / "out" / "wm"
+    shutil.copytree(small_dataset.root, work / "data")
+    shutil.copytree(model_folder(config.world_model.path), model)
+    write(model / "train_config.json", {"dataset": {"root": "data"}, "output_dir": "out/wm"})
+    (work / "out" / "policy").mkdir()
+    policy = write(work / "out" / "policy" / "train_config.json", {
+        "env": {"world_model_path": "out/wm"}, "output_dir": "out/policy"
+    }).parent  # fmt: skip
+    write(policy / "config.json", {})
+    for folder, prefix in ((work, ""), (work / "out", "../"), (tmp_path, "work/"), (tmp_path, f"{work}/")):
+        monkeypatch.chdir(folder)
+        source = ChosenEpisodes(f"{prefix}data")
+        assert learnt_from(f"{prefix}out/wm", LabelledRollouts.read(source)) == 6
+        assert trained_inside(f"{prefix}out/policy", f"{prefix}out/wm")
 
 
 def test_rollouts_count_within_the_length_of_an_episode_and_must_both_succeed_and_fail(

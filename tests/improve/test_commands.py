@@ -27,7 +27,7 @@ from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve import commands, learnt
 from lerobot_wmrl.improve.findings import few_decisions, one_sided_tasks, usual_length
-from lerobot_wmrl.improve.progress import CLONED, DISTILLED, FITTED, PPO, SFT
+from lerobot_wmrl.improve.progress import CLONED, DISTILLED, FITTED, PPO, SFT, Progress
 from lerobot_wmrl.improve.report.words import reservations
 from lerobot_wmrl.scripts.compare import CompareConfig
 from lerobot_wmrl.scripts.improve import settings
@@ -35,6 +35,11 @@ from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerCon
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
 from tests.improve.made_up import commands_of, improvement_of, made_commands
 from tests.rl.checkpoints import save_untrained_policy
+
+
+def imagined_comparison(improvement: Progress, folder: Path) -> list[str]:
+    """Return the command that compares the policies on 256 imagined starts."""
+    return commands.compare_command(improvement, folder, commands.imagination(improvement), 256)
 
 
 @pytest.mark.parametrize(
@@ -79,11 +84,15 @@ def test_no_start_is_imagined_twice_where_one_task_has_few(
     monkeypatch.setattr(learnt, "MAX_STARTS", 4)
     improvement = improvement_of(tmp_path, total=6, fewest=6)
     improvement.plan.config.dataset = ChosenEpisodes(str(root))
-    assert "--n_episodes=4" in commands.compare(improvement, tmp_path, commands.imagination(improvement), 256)
+    assert "--n_episodes=4" in commands.compare_command(
+        improvement, tmp_path, commands.imagination(improvement), 256
+    )
     table = read_episodes(open_dataset(root))
     two = replace(table, columns={**table.columns, "start.task": np.array([0, 0, 0, 0, 1, 1])})
     monkeypatch.setattr(type(improvement.learnt), "chosen", lambda self: two)
-    assert "--n_episodes=1" in commands.compare(improvement, tmp_path, commands.imagination(improvement), 256)
+    assert "--n_episodes=1" in commands.compare_command(
+        improvement, tmp_path, commands.imagination(improvement), 256
+    )
 
 
 def test_another_round_does_not_double_the_frames_of_a_rollout(tmp_path: Path) -> None:
@@ -93,7 +102,7 @@ def test_another_round_does_not_double_the_frames_of_a_rollout(tmp_path: Path) -
     assert improvement.plan.frame_limit == 160
     improvement.plan.config.max_frames = 80
     assert improvement.plan.frame_limit == 80
-    assert "--max_frames=80" in (commands.another_round(improvement) or [])
+    assert "--max_frames=80" in (commands.another_round_command(improvement) or [])
 
 
 @pytest.mark.parametrize("size", ["tiny", "demo", "cpu"])
@@ -257,7 +266,7 @@ def test_lerobot_edits_the_dataset_in_a_folder_with_any_name(tmp_path: Path) -> 
     numbers = dict.fromkeys(("observation.state", "action", "effort"), "float32")
     improvement = improvement_of(tmp_path, root=Path("2024_01_15"), columns=numbers)
     improvement.plan.config.rollouts, improvement.plan.config.real_env = 20, PushtEnv()
-    config = draccus.parse(EditDatasetConfig, args=commands.columns(improvement.plan)[1:])
+    config = draccus.parse(EditDatasetConfig, args=commands.columns_command(improvement.plan)[1:])
     assert (config.root, config.operation.feature_names) == ("2024_01_15", ["effort"])
 
 

@@ -210,7 +210,7 @@ def test_a_dataset_that_has_changed_is_not_taken_for_the_one_before(
     def stop(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lerobot_wmrl.common.stages.run_stages", stop)
+    monkeypatch.setattr("lerobot_wmrl.scripts.improve.run_stages", stop)
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             improve(config)

@@ -183,12 +183,12 @@ def test_a_success_in_imagination_is_said_to_be_a_belief(finished: Progress) -> 
 def test_one_of_several_tasks_is_driven(finished: Progress) -> None:
     config = replace(finished.plan.config, real_env=WmrlManiSkillEnv(task="pull,push"))
     several = replace(finished, plan=replace(finished.plan, config=config))
-    assert "--real_env.task=pull" in commands.drive(several)
+    assert "--real_env.task=pull" in commands.drive_command(several)
 
 
 def test_the_command_that_drives_the_world_model_takes_its_flags(finished: Progress) -> None:
     finished.plan.config.dataset.episodes = [0, 2]
-    command = shlex.join(commands.drive(finished))
+    command = shlex.join(commands.drive_command(finished))
     check(command)
     assert "--dataset.root=data " in command
     assert "--done_threshold=0.95" in command
@@ -202,10 +202,10 @@ def test_another_round_begins_from_the_policy_to_use_on_all_episodes(
     finished: Progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From starts of its own."""
-    assert commands.another_round(finished) is None
+    assert commands.another_round_command(finished) is None
     assert "Another round" not in text_of(finished)
     finished.plan.config.rollouts, finished.plan.config.seed = 20, 7
-    command = shlex.join(commands.another_round(finished) or [])
+    command = shlex.join(commands.another_round_command(finished) or [])
     check(command)
     merged = f"--dataset.root={finished.plan.out}/merged --real_env.type=pusht --rollouts=20"
     assert (
@@ -273,7 +273,7 @@ def test_the_policy_to_use_is_the_best_one_on_other_starts(
     assert f"Policy to use: {chosen}, {path}. None succeeded more often in pusht, on starts set aside" in said
     assert said.count(": better") + said.count(": worse") + said.count(": not decided") == 3
     assert said.count(f"{chosen}, against ") + said.count(f", against {chosen}:") == 3
-    assert f"--policy.path={path}" in commands.drive(finished)
+    assert f"--policy.path={path}" in commands.drive_command(finished)
     assert f'<tr class="chosen"><td>{chosen}</td>' in text_of(finished)
     assert json.loads((finished.plan.out / "summary.json").read_text())["chosen"] == chosen
 

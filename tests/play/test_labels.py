@@ -1,12 +1,14 @@
 """Labels by hand, in Chromium and by requests."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -27,6 +29,7 @@ from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.play.label_page import LabelPage
 from lerobot_wmrl.play.labels import ByHandRule
 from lerobot_wmrl.scripts.label import LabelConfig, label
+from tests.relabelled import relabelled
 
 CAMERA = "observation.images.third_view"
 
@@ -228,6 +231,26 @@ def test_labels_of_another_dataset_are_refused(rule, unlabelled, small_dataset):
     page_of(rule, unlabelled).label(0, 1)
     with pytest.raises(FieldError, match=r"^file=.*: holds the labels of .*; choose another file"):
         page_of(rule, small_dataset)
+
+
+def test_labels_of_what_was_recorded_there_before_are_refused(rule, small_dataset, tmp_path):
+    """Episodes of the same lengths, in the same folder."""
+    shutil.copytree(small_dataset.root, tmp_path / "data")
+    page_of(rule, open_dataset(tmp_path / "data")).label(0, 1)
+    shutil.rmtree(tmp_path / "data")
+    shorter = (np.arange(len(small_dataset)) % 20 > 3).tolist()
+    relabelled(Path(small_dataset.root), tmp_path / "data", {"next.success": shorter})
+    with pytest.raises(FieldError, match=r"^file=.*: holds the labels of .*data, as it was then"):
+        page_of(rule, open_dataset(tmp_path / "data"))
+
+
+@pytest.mark.parametrize(("episode", "first"), [("0", 500), ("6", 1), ("1", "2"), ("1", -1), ("1", True)])
+def test_a_label_in_the_file_that_cannot_be_is_named(rule, unlabelled, episode, first):
+    page_of(rule, unlabelled).label(3, 2)
+    stored = json.loads(rule.file.read_text())
+    rule.file.write_text(json.dumps(stored | {"labels": {**stored["labels"], episode: first}}))
+    with pytest.raises(FieldError, match=rf"^file=.*: the label {episode}: {json.dumps(first)} cannot be \("):
+        page_of(rule, unlabelled)
 
 
 def test_a_file_that_holds_no_labels_is_refused(rule, unlabelled):

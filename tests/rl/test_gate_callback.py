@@ -14,8 +14,7 @@ from lerobot.envs.configs import LiberoEnv
 from lerobot_wmrl.common.checkpoints import model_folder
 from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.lerobot_commands import env_flags
-from lerobot_wmrl.common.presets import format_flags
+from lerobot_wmrl.common.flags import env_flags, format_flags
 from lerobot_wmrl.common.seeds import GATE_SEED
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.common.success_criterion import SuccessCriterion

@@ -16,7 +16,8 @@ from lerobot_wmrl.data.dataset import fingerprint, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.rewards.configuration_rewards import ProxyConfig
 from lerobot_wmrl.rewards.modeling_rewards import ProxyRewardModel
-from lerobot_wmrl.scripts.label import longest_run, main
+from lerobot_wmrl.rewards.success_rules import longest_run
+from lerobot_wmrl.scripts.label import main
 
 IMAGE = "observation.images.third_view"
 
@@ -179,6 +180,9 @@ def test_a_reward_model_may_say_it(unlabelled: Path, tmp_path: Path, monkeypatch
     (["--success.type=ends", "--success.last=0"], "--success.last=0: must be at least 1"),
     (["--success.type=first_frames"], "--success.first: names no episode that succeeds"),
     (["--success.type=first_frames", "--success.first={1:3}"], "write a space after each colon"),
+    (["--success.type=first_frames", "--success.first={1:45}"], "write a space after each colon"),
+    (["--success.type=first_frames", "--success.first={0: 5.5}"], "0: 5.5 is not .*give whole numbers"),
+    (["--success.type=first_frames", "--success.first={a: 5}"], "a: 5.0 is not .*give whole numbers"),
     (["--success.type=first_frames", "--success.first={1: 99}"], "episode 1 has no frame 99; its frames are"),
     (["--success.type=column", "--success.column=score"], "no column of one number .*next.reward"),
     (

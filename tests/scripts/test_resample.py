@@ -67,7 +67,10 @@ def test_what_happened_between_two_kept_frames_belongs_to_the_first(
     resample(
         monkeypatch, f"--dataset.root={source}", "--every=2", "--displacements=[dx]", f"--output_dir={slow}"
     )
-    assert "2 episodes, 6 frames at 25 Hz, the longest has 4" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "2 episodes, 6 frames at 25 Hz, the longest has 4" in said
+    assert "Success holds for 1 to 1 frames in a row" in said
+    assert "2 of them for fewer than 3: these count with --env.done_frames=1" in said
     dataset = open_dataset(slow)
     table = read_episodes(dataset)
     assert (dataset.fps, table.length.tolist()) == (25, [4, 2])

@@ -12,13 +12,15 @@ import torch
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
+from lerobot_wmrl.data.dataset import ChosenEpisodes, DatasetSource, open_dataset
 from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+from lerobot_wmrl.scripts import train_world_model
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.training_data import make_sampler
 from tests.trained import (
     action_config,
     run_training,
@@ -195,10 +197,48 @@ def test_numbers_that_are_none_are_named_with_their_episode(column, value, small
 def test_episodes_of_one_frame_are_named(build, make_synthetic_dataset, trained_models, tmp_path):
     root = Path(make_synthetic_dataset(tmp_path / "dataset", episodes=3, length=1).root)
     with pytest.raises(
-        ValueError, match="3 episodes of 3 frames in all; a world model learns from episodes of two"
+        ValueError,
+        match="3 episodes to learn from, of 3 frames in all; a world model learns from episodes of",
     ):
         run_training(build(trained_models["frame_tokenizer"]), root, tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_chosen_episodes_of_one_frame_are_named(small_dataset, trained_models):
+    """Others of the dataset may be longer."""
+    table = read_episodes(small_dataset)
+    table.length[[1, 3]] = 1
+    model = load_model(trained_models["action_world_model"], "action_world_model")
+    with pytest.raises(FieldError, match=r"^dataset\.root=.*: 2 episodes to learn from, of 2 frames in all"):
+        make_sampler(model, table, [1, 3], batch_size=2, seed=0)
+    assert len(make_sampler(model, table, [1, 2], batch_size=2, seed=0).episodes) == 2
+
+
+def test_a_recording_that_was_stopped_is_named_as_such(small_dataset, tmp_path):
+    """LeRobot writes the table of episodes at the end, and looks for one that is missing on the hub."""
+    root = tmp_path / "stopped"
+    shutil.copytree(small_dataset.root, root)
+    shutil.rmtree(root / "meta" / "episodes")
+    for source in (DatasetSource(str(root)), DatasetSource(str(root), "somebody/else")):
+        with pytest.raises(FieldError, match=r"^dataset\.root=.*stopped: its recording was not finished"):
+            source.open()
+
+
+def test_a_camera_that_a_further_dataset_lacks_is_named_with_it(
+    small_dataset, make_synthetic_dataset, tmp_path, capsys, monkeypatch
+):
+    other = make_synthetic_dataset(tmp_path / "other", episodes=2, length=5, cameras=("wrist",)).root
+    monkeypatch.setattr("sys.argv", [
+        "lerobot-wmrl-train-world-model", "--model.type=frame_tokenizer", "--model.device=cpu",
+        "--model.tokenizer.cameras=[third_view]", "--model.tokenizer.image_size=32",
+        f"--dataset.root={small_dataset.root}", f"--dataset.more=[{other}]",
+        f"--output_dir={tmp_path / 'run'}",
+    ])  # fmt: skip
+    with pytest.raises(SystemExit):
+        train_world_model.main()
+    assert (
+        f"--dataset.more={other}: the dataset has no observation.images.third_view" in capsys.readouterr().err
+    )
 
 
 def test_a_split_without_episodes_is_named(small_dataset):
@@ -234,7 +274,8 @@ def test_a_trained_model_does_not_go_on_with_actions_of_another_width(
     config = load_model(trained, "action_world_model").config
     config.pretrained_path, config.action_size = str(trained), 5
     with pytest.raises(
-        ValueError, match="action: the world model was trained with 5 components, the dataset has 7"
+        FieldError,
+        match=r"^dataset\.root=.*: action: the world model was trained with 5 components, .* has 7",
     ):
         run_training(config, root, tmp_path / "run")
 

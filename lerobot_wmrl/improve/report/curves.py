@@ -9,8 +9,9 @@ import numpy as np
 
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.improve.progress import Progress
+from lerobot_wmrl.improve.stage_names import StageName
 
-MODELS = {"tokenizer": "Frame tokenizer", "world_model": "World model"}
+MODELS = {StageName.TOKENIZER: "Frame tokenizer", StageName.WORLD_MODEL: "World model"}
 """Models that are trained, by their folders."""
 
 STEP, ITERATION = "step", "iteration"
@@ -49,9 +50,9 @@ def training_curves(progress: Progress) -> dict[str, Curve]:
     plan, out = progress.plan, progress.plan.out
     curves = {title: curve(read_metrics(out / folder), "loss") for folder, title in MODELS.items()}
     if plan.clones:
-        curves["Further BC"] = lerobot_train_curve(out / "logs" / "cloned.log")
-    runs = {"rl": str(plan.config.algorithm["algorithm.type"])}
-    runs |= {"distilled": "distillation"} if progress.has_distilled else {}
+        curves["Further BC"] = lerobot_train_curve(out / "logs" / f"{StageName.CLONED}.log")
+    runs = {StageName.RL: str(plan.config.algorithm["algorithm.type"])}
+    runs |= {StageName.DISTILLED: "distillation"} if progress.has_distilled else {}
     for folder, algorithm in runs.items():
         rows = read_metrics(out / folder)
         curves |= {title: curve(rows, column, ITERATION) for column, title in PANELS[algorithm].items()}

@@ -30,6 +30,7 @@ from lerobot_wmrl.improve.report.words import (
     trust,
 )
 from lerobot_wmrl.improve.results import Place, read_check, read_gate, read_selection
+from lerobot_wmrl.improve.stage_names import StageName
 
 PAGE = "report.html"
 
@@ -91,7 +92,7 @@ class Page:
         return cls(
             progress, f"{plan.policy}, improved in imagination", plan.config.seed,
             stage_records(plan.out, commands.stages(progress)), [compared(progress)],
-            {"recorded": plan.out / "check"},
+            {"recorded": plan.folder(StageName.CHECK)},
         )  # fmt: skip
 
     def write(self, folder: Path) -> Path:
@@ -159,8 +160,8 @@ class Page:
             warnings=gate_warnings(progress),
             pictures=picture_sections(self.replays),
             curves=[figures.line(curve, title) for title, curve in curves.items()],
-            drive=shlex.join(commands.drive(progress)),
-            another_round=shlex.join(commands.another_round(progress) or []),
+            drive=shlex.join(commands.drive_command(progress)),
+            another_round=shlex.join(commands.another_round_command(progress) or []),
             stages=self._all_records(),
         )
 

@@ -20,6 +20,7 @@ from lerobot_wmrl.improve.results import (
     read_place,
     read_selection,
 )
+from lerobot_wmrl.improve.stage_names import StageName
 from lerobot_wmrl.rl.selection import REAL, best_iteration, success
 
 
@@ -27,7 +28,7 @@ def compared(progress: Progress) -> Place:
     """Read the comparison that ends an improvement."""
     real = progress.plan.config.real_env
     where = "in imagination, from frames of the dataset" if real is None else f"in {real.type}"
-    return read_place(where, progress.plan.out / "comparison", [*progress.policies])
+    return read_place(where, progress.plan.folder(StageName.COMPARISON), [*progress.policies])
 
 
 def read_choice(progress: Progress) -> Place | None:
@@ -35,7 +36,7 @@ def read_choice(progress: Progress) -> Place | None:
     real = progress.plan.config.real_env
     if real is None or not progress.plan.config.selects:
         return None
-    return read_place(f"in {real.type}", progress.plan.out / "choice", [*progress.policies])
+    return read_place(f"in {real.type}", progress.plan.folder(StageName.CHOICE), [*progress.policies])
 
 
 def rollouts_line(progress: Progress) -> list[str]:
@@ -147,7 +148,7 @@ def reservations(progress: Progress) -> list[str]:
             "This is what the world model predicts, and shows nothing about the real world. Run the policies "
             "there, label what they did, and run the command again on all episodes."
         )
-    if reason := read_record(plan.out, "rl").get(FAILED):
+    if reason := read_record(plan.out, StageName.RL).get(FAILED):
         kept = progress.has_trained and not progress.kept_start
         left = "A checkpoint from before that is compared" if kept else "It left no policy"
         notes.append(f"RL stopped ({plan.out / 'logs' / 'rl.log'}). {left}. {reason}")
@@ -169,7 +170,7 @@ def start_line(progress: Progress) -> list[str]:
     """Say which policy RL began with, and why; nothing if there was no choice."""
     if not progress.plan.clones:
         return []
-    rates = read_place("in imagination", progress.plan.out / "start", [CLONED, SFT]).rates
+    rates = read_place("in imagination", progress.plan.folder(StageName.START), [CLONED, SFT]).rates
     shown = ", ".join(f"{title} {rate}" for title, rate in rates.items())
     return [
         f"RL began with: {progress.start()}. Success in imagination, from frames of the dataset: {shown}. "
@@ -181,7 +182,7 @@ def trust(progress: Progress) -> str:
     """Say how well the world model tells recorded successes from failures."""
     check = read_check(progress.plan.out)
     wins, losses = check["successes"], check["failures"]
-    whose = "rollouts" if Path(check["dataset"]) == progress.plan.out / "merged" else "episodes"
+    whose = "rollouts" if Path(check["dataset"]) == progress.plan.folder(StageName.MERGED) else "episodes"
     held_out = check["split"] == "validation"
     kind = f"held-out {whose}" if held_out else f"{whose} (most of which it has learnt from)"
     if not wins or not losses:
