@@ -21,6 +21,7 @@ from experiments.value_cells import (
     groups,
     outcomes,
 )
+from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import RunsMean
 from lerobot_wmrl.common.stored_help import FOLDER
 from lerobot_wmrl.improve.progress import CLONED, DISTILLED, PPO, SFT
@@ -49,20 +50,30 @@ def test_todays_commands_take_the_flags_of_the_page(name: str) -> None:
         check(command)
 
 
-def test_the_readmes_python_runs(
-    trained_models: dict[str, Path], small_dataset: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (code,) = blocks(ROOT / "README.md", "python")
-    paths = {
-        "outputs/demo/improve/world_model": trained_models["action_world_model"],
-        "outputs/demo/text_world_model": trained_models["text_world_model"],
-        "outputs/demo/improve/merged": small_dataset.root,
-    }
-    for written, made in paths.items():
-        assert written in code
-        code = code.replace(written, str(made))
+@pytest.mark.parametrize(("name", "said"), [
+    ("README.md", r"torch.Size\(\[16, 3, 32, 32\]\) tensor\(\["),
+    ("docs/world_models.md", r"(True|False) .* of 2.* of 4"),
+    ("docs/protocol.md", ""),
+])  # fmt: skip
+def test_the_python_of_a_page_runs(
+    name: str, said: str, trained_models: dict[str, Path], small_dataset: Any, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    for place, made in (
+        ("outputs/demo/improve/world_model", trained_models["action_world_model"]),
+        ("outputs/demo/text_world_model", trained_models["text_world_model"]),
+        ("outputs/demo/improve/merged", small_dataset.root),
+        ("outputs/world_model", trained_models["action_world_model"]),
+        ("data/demonstrations", small_dataset.root), ("data/rollouts", small_dataset.root),
+    ):  # fmt: skip
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / place).symlink_to(made)
+    budget = tmp_path / "outputs" / "fair" / "budget.json"
+    write_json(budget, {"limits": {"demonstrations": 8, "rollouts": 300, "play": 0}})
+    monkeypatch.chdir(tmp_path)
+    (code,) = blocks(ROOT / name, "python")
     exec(code, {})
-    assert "torch.Size([16, 3, 32, 32]) tensor([" in capsys.readouterr().out
+    assert re.search(said, capsys.readouterr().out)
 
 
 @pytest.mark.parametrize("name", [str(page.relative_to(ROOT)) for page in PAGES])

@@ -21,7 +21,7 @@ from lerobot.utils.utils import SuppressProgressBars
 from lerobot_wmrl.common.errors import FieldError, first_line, renamed
 from lerobot_wmrl.common.flags import flag_as_typed
 from lerobot_wmrl.data.embodiment import whole_rate
-from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes
+from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes, require_episodes
 
 VIDEO_BACKEND: Final = "pyav"
 """pyav ships its own FFmpeg, torchcodec needs the system's. Speed matters little: frames are decoded once."""
@@ -85,8 +85,9 @@ class DatasetSource:
             return open_dataset(self.root, self.repo_id, episodes)
         try:
             return download_dataset(self.repo_id, self.revision, self.root or None, episodes)
-        except FieldError:
-            if not self.root or not (Path(self.root) / "meta" / "info.json").is_file():
+        except FieldError as error:
+            here = self.root and (Path(self.root) / "meta" / "info.json").is_file()
+            if not here or error.field == "dataset.episodes":
                 raise
         return open_dataset(self.root, self.repo_id, episodes)  # which says what is missing there
 
@@ -151,6 +152,8 @@ def open_dataset(
         missing = lacking and missing_files(Path(root), episodes)
         if not missing:
             dataset = open_rows(name, episodes if lacking else None, root=root)
+    except FieldError:
+        raise
     except OLDER_FORMAT as error:
         raise older_format("dataset.root", root, name, root) from error
     except Exception as error:  # parquet, JSON, datasets and the hub each raise their own
@@ -193,6 +196,8 @@ def download_dataset(
     """
     try:
         dataset = open_rows(repo_id, episodes, root=root, revision=revision)
+    except FieldError:
+        raise
     except Exception as error:  # the hub's client, parquet and JSON each raise their own
         if isinstance(error, OLDER_FORMAT) and revision is None:
             copy = Path("data") / repo_id.rpartition("/")[2]
@@ -209,15 +214,18 @@ def open_rows(repo_id: str, episodes: Collection[int] | None, **where: Any) -> L
     """Open a dataset with all its rows; LeRobot downloads what is missing of it.
 
     Args:
-        episodes: those whose videos are needed, all if None. One that there is not is for the reader of the
-            rows to refuse.
+        episodes: those whose videos are needed, all if None.
         where: LeRobot's `root` and `revision`.
+
+    Raises:
+        FieldError: there is no episode among these, or one of them is not in the dataset.
     """
     open_videos_of = partial(LeRobotDataset, repo_id, video_backend=VIDEO_BACKEND, **where)
     if episodes is None:
         return open_videos_of()
-    total = LeRobotDatasetMetadata(repo_id, **where).total_episodes
-    dataset = open_videos_of(episodes=[each for each in episodes if 0 <= each < total] or None)
+    meta = LeRobotDatasetMetadata(repo_id, **where)
+    require_episodes(episodes, meta.total_episodes, meta.root)
+    dataset = open_videos_of(episodes=list(episodes))
     if missing_files(dataset.root, episodes):
         snapshot_download(
             repo_id, repo_type="dataset", revision=dataset.revision, allow_patterns="data/*",
@@ -246,12 +254,13 @@ def older_format(field: str, value: object, repo_id: str, root: str | Path) -> F
     )  # fmt: skip
 
 
-def fingerprint(root: Path) -> str:
-    """Return a short hash of a dataset's folder `meta` and of all its columns but pictures.
+def fingerprint(root: Path, meta: bool = True) -> str:
+    """Return a short hash of a dataset's columns but pictures, and with `meta` of that folder too.
 
     `meta` alone says nothing of labels: LeRobot keeps no statistics of a column that was added.
     """
-    files = sorted(path for suffix in ("json", "parquet") for path in (root / "meta").rglob(f"*.{suffix}"))
+    kinds = ("json", "parquet") if meta else ()
+    files = sorted(path for suffix in kinds for path in (root / "meta").rglob(f"*.{suffix}"))
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in files))
     pictures = {name for name, each in load_info(root).features.items() if each["dtype"] == "image"}
     rows = pyarrow.dataset.dataset(parquet_files(root), format="parquet")

@@ -1,7 +1,7 @@
 """Episodes of a LeRobotDataset: all columns but the pictures."""
 
 import logging
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -127,13 +127,8 @@ class EpisodeTable:
     def among(self, chosen: Sequence[int] | None) -> np.ndarray:
         """Mark the episodes that are `chosen`, all if None. FieldError names one that does not exist. (E,)"""
         indices = np.arange(len(self.start))
-        for episode in chosen or ():
-            if not 0 <= episode < len(indices):
-                raise FieldError(
-                    "dataset.episodes", list(chosen or ()),
-                    f"there is no episode {episode} in {self.dataset.root}",
-                    f"it has episodes 0 to {len(indices) - 1}",
-                )  # fmt: skip
+        if chosen:
+            require_episodes(chosen, len(indices), self.dataset.root)
         return indices >= 0 if chosen is None else np.isin(indices, chosen)
 
     def training(self, chosen: Sequence[int] | None) -> np.ndarray:
@@ -141,6 +136,18 @@ class EpisodeTable:
         FieldError names one that does not exist. (E,)"""
         marked: np.ndarray = self.among(chosen) & ~self.validation
         return marked
+
+
+def require_episodes(chosen: Collection[int], total: int, root: Path) -> None:
+    """Raise FieldError unless episodes are chosen, and a dataset of so many in all has them."""
+    if not chosen:
+        raise FieldError("dataset.episodes", [], "chooses no episode", "leave it out for all")
+    for episode in chosen:
+        if not 0 <= episode < total:
+            raise FieldError(
+                "dataset.episodes", list(chosen), f"there is no episode {episode} in {root}",
+                f"it has episodes 0 to {total - 1}",
+            )  # fmt: skip
 
 
 def count_tasks(tables: Sequence[EpisodeTable]) -> int:

@@ -193,16 +193,20 @@ def frames_to_tensor(frames: np.ndarray) -> Tensor:
 
 def file_stamps(dataset: LeRobotDataset) -> list[object]:
     """Return names, sizes and times of the dataset's files, and its fps, by which frames are found in videos:
-    a new recording needs caches of its own."""
+    a new recording needs caches of its own.
+
+    In the hub's cache the commit, which names the folder, stands for the videos: more of them may arrive.
+    """
     root = Path(dataset.root)
+    cached = cached_repo(root.absolute()) is not None
     files = sorted(
         path
-        for each in ("data", "meta", "videos")
+        for each in ("data", "meta", *(() if cached else ("videos",)))
         for path in files_below(root / each)
         if path.suffix in (".mp4", ".parquet")
     )
     stamps = [item for path in files for item in (path.name, path.stat().st_size, path.stat().st_mtime_ns)]
-    return [dataset.fps, *stamps]
+    return [dataset.fps, *([root.name] if cached else []), *stamps]
 
 
 def files_below(root: Path) -> Iterator[Path]:

@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
+from os.path import normpath
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -225,14 +226,16 @@ class Training(NamedTuple):
 
     def located(self, path: object) -> str:
         """Return where something lies that the settings name: relative paths are from where the training ran,
-        which its own `output_dir` tells. "" for nothing; as it is if it is not there, such as a hub id."""
+        which its own `output_dir` tells, as far as folders above that need no name. "" for nothing; as it is
+        if it is not there, such as a hub id."""
         if not path:
             return ""
         folder = training_folder(self.checkpoint)
         parts = Path(str(self.settings.get("output_dir") or "")).parts
-        if not parts or folder.parts[-len(parts) :] != parts:
+        up = parts.count("..")
+        if not parts[up:] or folder.parts[up - len(parts) :] != parts[up:]:
             return str(path)
-        place = Path(*folder.parts[: -len(parts)], str(path))
+        place = Path(normpath(Path(*folder.parts[: up - len(parts)], *["?"] * up, str(path))))
         return str(place if place.exists() else path)
 
 

@@ -7,13 +7,17 @@ model was not trained on. A false positive is a recorded failure that the model 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from lerobot_wmrl.common.statistics import Estimate, Proportion
 from lerobot_wmrl.common.success_criterion import SuccessCriterion
-from lerobot_wmrl.evaluation.outcomes import Outcomes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.evaluation.outcomes import Outcomes, labelled_recording, predict_outcomes
+from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
 MAX_FALSE_POSITIVE_RATE: Final = 0.05
 MIN_RECALL: Final = 0.9
@@ -66,6 +70,18 @@ class Gate:
             "auc": None if math.isnan(self.auc) else self.auc,
             "passed": self.passed,
         }
+
+
+def success_gate(
+    model: ActionWorldModelRewardModel, dataset_root: str | Path, criterion: SuccessCriterion
+) -> Gate:
+    """Replay every episode of a dataset of rollouts open loop and count false positives and recall.
+
+    Raises:
+        FieldError: the model cannot replay the dataset, or its episodes have no labels of success.
+    """
+    recording = labelled_recording(model, read_episodes(open_dataset(dataset_root)))
+    return gate_at(predict_outcomes(model, recording), criterion)
 
 
 def gate_at(outcomes: Outcomes, criterion: SuccessCriterion) -> Gate:

@@ -229,9 +229,10 @@ class StepCounter:
 def require_new_starts(envs: Envs, config: EnvConfig, n_episodes: int) -> None:
     """Raise FieldError if a world model or LIBERO has too few starts: some would count twice."""
     if isinstance(config, WorldModelEnv):
-        fewest = min(len(env.env.starts) for env in flat(envs))
-        limit = "max_starts" if fewest >= config.dataset.max_starts else "branches"
-        problem, more = "the world model has {} start frames", f", or give more with `env.dataset.{limit}`"
+        starts = [len(env.env.starts) for env in flat(envs)]
+        fewest, limited = min(starts), sum(starts) >= config.dataset.max_starts
+        more = ", or give more with `env.dataset.max_starts`" if limited else ", or give more of them"
+        problem = "the world model has {} start frames"
     elif counts_resets(config):
         fewest = min(len(states) for env in flat(envs) for states in env.call("_init_states"))
         problem, more = f"{config.type} has {{}} starts", ", or set `env.init_states` to false"

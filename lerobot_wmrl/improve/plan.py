@@ -16,7 +16,7 @@ from lerobot_wmrl.common.flags import Flags
 from lerobot_wmrl.common.policies import copy_checkpoint, load_processors
 from lerobot_wmrl.common.policy_checks import check_units
 from lerobot_wmrl.common.stages import in_fork
-from lerobot_wmrl.data.dataset import ChosenEpisodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes, DatasetSource
 from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment
 from lerobot_wmrl.data.episodes import SUCCESS, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -71,7 +71,8 @@ class Plan:
             FieldError: the policy cannot be improved with the dataset, or cannot act in the environment.
         """
         assert config.policy is not None
-        table = read_episodes(config.dataset.open())
+        opened = DatasetSource.open if config.rollouts else ChosenEpisodes.open  # whole ones can be merged
+        table = read_episodes(opened(config.dataset))
         preprocessor, postprocessor = load_processors(config.policy)
         policy = with_own_cameras(config.policy, preprocessor, table.dataset.features)
         adapted = without_renaming(preprocessor, policy) if policy is not config.policy else None

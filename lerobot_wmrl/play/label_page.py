@@ -44,7 +44,11 @@ class LabelPage:
         self.file, self.last, self.dataset, self.access = file, last, dataset, Access(host)
         self.lengths = [int(row["length"]) for row in dataset.meta.episodes]
         root = Path(dataset.root)
-        self.about = {"dataset": str(root.resolve()), "content": fingerprint(root), "lengths": self.lengths}
+        self.about = {
+            "dataset": str(root.resolve()),
+            "content": fingerprint(root, meta=False),
+            "lengths": self.lengths,
+        }
         self.labels = self._read()
         self.done = asyncio.Event()
         self.worker = ThreadPoolExecutor(1, "frames")
@@ -147,7 +151,7 @@ class LabelPage:
             raise FieldError("file", self.file, "holds no labels", "choose another file") from error
         if not same:
             raise FieldError(
-                "file", self.file, f"holds the labels of {stored.get('dataset')}, as it was then",
+                "file", self.file, f"holds the labels of {stored.get('dataset')} with other episodes",
                 "choose another file",
             )  # fmt: skip
         labels: Labels = {}

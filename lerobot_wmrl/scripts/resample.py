@@ -27,7 +27,7 @@ from lerobot_wmrl.common.lerobot_commands import edit_advice
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset, save_episode
 from lerobot_wmrl.data.decoding import decode, row_parts, rows_of
 from lerobot_wmrl.data.embodiment import component_names
-from lerobot_wmrl.data.episodes import SUCCESS_COLUMNS, read_episodes
+from lerobot_wmrl.data.episodes import SUCCESS, SUCCESS_COLUMNS, read_episodes
 from lerobot_wmrl.data.features import encoder_of
 from lerobot_wmrl.evaluation.accuracy import absolute_control
 from lerobot_wmrl.rewards.success_rules import duration_lines, longest_run
@@ -70,11 +70,12 @@ def resample(cfg: ResampleConfig) -> None:
     with writing("output_dir", cfg.output_dir, resumes=False):
         write_resampled(dataset, cfg, summed)
     copied = read_episodes(open_dataset(cfg.output_dir))
-    success = [copied.done[rows] for rows in copied.rows(range(len(copied.start)))]
+    labelled = SUCCESS in copied.dataset.features  # next.done may say no more than that episodes end
+    success = [copied.success_target[rows] for rows in copied.rows(range(len(copied.start)))]
     lines = [
         f"{cfg.output_dir}: {len(copied.length)} episodes, {copied.length.sum()} frames at "
         f"{copied.dataset.fps} Hz, the longest has {copied.length.max()}.",
-        *duration_lines([longest_run(each) for each in success]),
+        *duration_lines([longest_run(each) for each in success] if labelled else []),
         f"Next: lerobot-train {flag_as_typed('dataset.root', cfg.output_dir)} …",
     ]
     print("\n".join(lines))

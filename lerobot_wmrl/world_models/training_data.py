@@ -84,6 +84,7 @@ def make_sampler(
     chosen: Sequence[int] | None,
     batch_size: int,
     seed: int,
+    measured: bool = True,
 ) -> ClipSampler | FrameSampler:
     """Make the sampler of training batches for this kind of model.
 
@@ -93,9 +94,11 @@ def make_sampler(
         chosen: indices of episodes to learn from, all by default; held-out episodes are left out.
         batch_size: frames (tokenizer) or clips (world models) a batch.
         seed: seed of the draws.
+        measured: whether the model is measured on the held-out episodes after the training: those that cannot
+            be read then are named now.
 
     Raises:
-        FieldError: there is no episode to learn from.
+        FieldError: there is no episode to learn from, or one cannot be read.
     """
     episodes = table.training(chosen)
     if not episodes.any():
@@ -105,11 +108,11 @@ def make_sampler(
         )  # fmt: skip
     config: Any = model.config
     frames = cached_frames(table.dataset, config.tokenizer.camera_keys, config.tokenizer.image_size)
-    measured = table.among(chosen)  # also after hours of training: what cannot be read says so now
+    read = table.among(chosen) if measured else episodes
     if isinstance(config, TextWorldModelConfig):
         golden = golden_episodes(table)
-        episodes, measured = require_golden(table, episodes & golden), measured & golden
-    frames.fill(table.row_numbers(measured.nonzero()[0]))
+        episodes, read = require_golden(table, episodes & golden), read & golden
+    frames.fill(table.row_numbers(read.nonzero()[0]))
     if isinstance(config, FrameTokenizerConfig):
         if config.tokenizer.success:
             require_success_labels(table, episodes)
@@ -117,7 +120,7 @@ def make_sampler(
             table, frames, episodes.nonzero()[0], config.tokenizer.cameras, batch_size, seed, config.device
         )
     check_episode_lengths(table.dataset.root, int(episodes.sum()), int(table.length[episodes].sum()))
-    require_readable(model, table, measured)
+    require_readable(model, table, read)
     if isinstance(config, ActionWorldModelConfig) and not table.has_labels:
         logging.warning(
             "dataset.root=%s: has neither next.success nor next.done: the model cannot learn from it what "
@@ -228,7 +231,7 @@ def make_joint_sampler(
         note_outcomes(model.config, [(table, data.episodes), *((each, None) for each in more)])
     first = make_sampler(model, table, data.episodes, batch_size, seed)
     with renamed("dataset.root", "dataset.more"):
-        samplers = [make_sampler(model, each, None, batch_size, seed) for each in more]
+        samplers = [make_sampler(model, each, None, batch_size, seed, measured=False) for each in more]
     return InTurn(first, samplers) if samplers else first
 
 

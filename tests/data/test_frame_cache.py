@@ -5,6 +5,7 @@ import os
 import shutil
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -143,9 +144,9 @@ def test_depth_in_metres_is_refused():
 @pytest.mark.parametrize("name", ["third_view_depth", "../state"])
 def test_only_a_camera_of_colours_is_looked_at(name, deep_dataset):
     features = {**deep_dataset.features, "observation.images.../state": deep_dataset.features["action"]}
-    key = f"observation.images.{name}"
+    meta, key = SimpleNamespace(features=features), f"observation.images.{name}"
     with pytest.raises(ValueError, match=r"has no .* \(its cameras: observation.images.third_view\)"):
-        check_cameras(features, [key], "tokenizer.cameras")
+        check_cameras(meta, [key], "tokenizer.cameras")
 
 
 def test_training_reads_depth_and_a_checkpoint_keeps_its_branch(deep_dataset, models):

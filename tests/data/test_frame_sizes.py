@@ -16,7 +16,7 @@ from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.decoding import decode
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
-from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig, TokenizerConfig
 from lerobot_wmrl.world_models.training_data import make_sampler
 
 
@@ -46,9 +46,8 @@ def test_episodes_that_nobody_reads_are_not_decoded(
     seen: set[int] = set()
     monkeypatch.setattr(frame_cache, "decode", decoded)
     monkeypatch.setattr(frame_cache, "cache_dir", lambda _: tmp_path)
-    model = SimpleNamespace(name="frame_tokenizer", config=SimpleNamespace(
-        tokenizer=TokenizerConfig(cameras=["third_view"], image_size=32), device="cpu",
-    ))  # fmt: skip
+    tokenizer = TokenizerConfig(cameras=["third_view"], image_size=32)
+    model: Any = SimpleNamespace(config=FrameTokenizerConfig(tokenizer=tokenizer, device="cpu"))
     sampler: Any = make_sampler(model, read_episodes(small_dataset), [1, 4], batch_size=64, seed=0)
     assert seen == {1, 4}
     sampler(0)

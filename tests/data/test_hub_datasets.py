@@ -1,6 +1,7 @@
 """A dataset that is named by its name on the hub alone."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from lerobot_wmrl.data import frame_cache
 from lerobot_wmrl.data.dataset import ChosenEpisodes, DatasetSource, TrainingData, open_dataset
 from lerobot_wmrl.data.decoding import decode, rows_of
 from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.evaluation.evidence import learnt_digests
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from tests.hub_server import Hub
@@ -85,10 +87,17 @@ def test_a_folder_that_lacks_files_and_is_on_no_hub_says_what_it_lacks(
 
 @pytest.mark.parametrize("folder", ["", "mine"])
 def test_of_chosen_episodes_alone_videos_are_downloaded(
-    folder: str, in_many_files: LeRobotDataset, hub: Hub, tmp_path: Path
+    folder: str, in_many_files: LeRobotDataset, hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = str(tmp_path / folder) if folder else ""
-    source = ChosenEpisodes(root, NAME, episodes=[1, 3, 3, 9])
+    for wrong, message in (
+        ([1, 9], "there is no episode 9 in"),
+        ([9], "there is no"),
+        ([], "chooses no episode"),
+    ):
+        with pytest.raises(ValueError, match=rf"^dataset\.episodes={re.escape(str(wrong))}: {message}"):
+            ChosenEpisodes(root, NAME, episodes=wrong).open()
+    source = ChosenEpisodes(root, NAME, episodes=[1, 3, 3])
     dataset = source.open()
     videos = sorted(path.name for path in Path(dataset.root).glob("videos/**/*.mp4"))
     assert videos == ["file-001.mp4", "file-003.mp4"]
@@ -99,8 +108,12 @@ def test_of_chosen_episodes_alone_videos_are_downloaded(
         rows = rows_of(dataset, episode)
         frames = decode(dataset, episode, key, rows)
         assert (frames == decode(in_many_files, episode, key, rows)).all()
-    with pytest.raises(ValueError, match=r"dataset\.episodes=\[1, 3, 3, 9\]: there is no episode 9"):
-        table.among(source.episodes)
+    caches = [cached_frames(dataset, [key], 32)]
+    assert caches[0][rows_of(dataset, 1)].any()
+    monkeypatch.setattr(frame_cache, "decode", None)
+    caches.append(cached_frames(ChosenEpisodes(root, NAME, episodes=[0]).open(), [key], 32))
+    assert bool(folder) or (caches[1][rows_of(dataset, 1)] == caches[0][rows_of(dataset, 1)]).all()
+    next(Path(dataset.root).glob("videos/**/file-000.mp4")).unlink()
     hub.requests.clear()
     assert len(open_dataset(dataset.root, episodes=[3])) == len(in_many_files)
     source.open()

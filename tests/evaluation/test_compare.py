@@ -361,10 +361,8 @@ def test_a_world_model_compares_a_policy_with_a_planner(imagination, tmp_path):
         policies=[str(policy), str(planner)], env=imagination, n_episodes=7, output_dir=tmp_path / "out"
     )
     fewer = replace(imagination, dataset=replace(imagination.dataset, max_starts=4))
-    for env, starts, setting in ((imagination, 6, "branches"), (fewer, 4, "max_starts")):
-        message = (
-            rf"n_episodes=7: .* has {starts} start frames .* at most {starts}, .*env\.dataset\.{setting}"
-        )
+    for env, starts, setting in ((imagination, 6, "of them"), (fewer, 4, "with `env.dataset.max_starts`")):
+        message = rf"n_episodes=7: .* has {starts} start frames .* at most {starts}, or give more {setting}"
         with pytest.raises(ValueError, match=message):
             compare(replace(config, env=env))
     assert not config.output_dir.exists()

@@ -410,6 +410,10 @@ def test_what_was_trained_where_is_known_in_every_folder(config, small_dataset, 
         "env": {"world_model_path": "out/wm"}, "output_dir": "out/policy"
     }).parent  # fmt: skip
     write(policy / "config.json", {})
+    write(model / "train_config.json", {"dataset": {"root": "../data"}, "output_dir": "../out/wm"})
+    monkeypatch.chdir(work)
+    assert learnt_from("out/wm", LabelledRollouts.read(ChosenEpisodes("data"))) == 6, "from work/somewhere"
+    write(model / "train_config.json", {"dataset": {"root": "data"}, "output_dir": "out/wm"})
     for folder, prefix in ((work, ""), (work / "out", "../"), (tmp_path, "work/"), (tmp_path, f"{work}/")):
         monkeypatch.chdir(folder)
         source = ChosenEpisodes(f"{prefix}data")

@@ -4,7 +4,6 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,8 +26,8 @@ from lerobot_wmrl.evaluation.accuracy import (
     measure,
     robustness,
 )
-from lerobot_wmrl.evaluation.gate import Gate, gate_at
-from lerobot_wmrl.evaluation.outcomes import Outcomes, labelled_recording, predict_outcomes
+from lerobot_wmrl.evaluation.gate import gate_at, success_gate
+from lerobot_wmrl.evaluation.outcomes import Outcomes
 from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording, replay_episodes
 from lerobot_wmrl.evaluation.report import evaluate
 from lerobot_wmrl.evaluation.reward_curves import reward_along_episode
@@ -197,12 +196,6 @@ def test_frames_of_long_episodes_are_compared_in_part_and_outcomes_as_a_whole(so
     for run in replay_episodes(model, source, np.arange(2)):
         assert len(run.done) == source.table.length[run.episode]
         assert len(measure(model, source, run, None).steps["psnr"]) == 4
-
-
-def success_gate(model: Any, root: Path, criterion: SuccessCriterion) -> Gate:
-    """Replay every episode of a dataset, and count false positives and recall."""
-    recording = labelled_recording(model, read_episodes(open_dataset(root)))
-    return gate_at(predict_outcomes(model, recording), criterion)
 
 
 def test_a_criterion_that_every_frame_meets_believes_every_failure(small_dataset, model):

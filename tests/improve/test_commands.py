@@ -27,6 +27,7 @@ from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve import commands, learnt
 from lerobot_wmrl.improve.findings import few_decisions, one_sided_tasks, usual_length
+from lerobot_wmrl.improve.plan import Plan
 from lerobot_wmrl.improve.progress import CLONED, DISTILLED, FITTED, PPO, SFT, Progress
 from lerobot_wmrl.improve.report.words import reservations
 from lerobot_wmrl.scripts.compare import CompareConfig
@@ -505,3 +506,23 @@ def test_one_long_recording_does_not_decide_how_long_episodes_usually_are() -> N
 
     assert usual([20] * 9 + [9000], [0] * 10) == 20
     assert usual([20] * 9 + [9000] + [50], [0] * 10 + [1]) == 50
+
+
+@pytest.mark.parametrize(("rollouts", "opened"), [(0, [1]), (5, None)])
+def test_a_dataset_that_rollouts_are_merged_with_is_opened_whole(
+    rollouts: int, opened: list[int] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LeRobot merges no dataset of which only the chosen episodes' videos were downloaded."""
+    asked = []
+
+    def note(source: ChosenEpisodes, episodes: list[int] | None) -> None:
+        asked.append(episodes)
+        raise InterruptedError
+
+    monkeypatch.setattr(ChosenEpisodes, "_open", note)
+    config: Any = SimpleNamespace(
+        policy=CnnConfig(), dataset=ChosenEpisodes("data", episodes=[1]), rollouts=rollouts
+    )
+    with pytest.raises(InterruptedError):
+        Plan.of(config)
+    assert asked == [opened]

@@ -146,7 +146,7 @@ def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, t
     assert "shows nothing about the real world" in report
     assert "most of which it has learnt from" in report
     assert "2 episodes, " in done.stdout
-    assert report.count("dataset.episodes=[0,2]") == 6
+    assert report.count("dataset.episodes=[0,2]") == 7
     assert "failures: 0. The world model will hardly tell them" in done.stdout
 
 

@@ -240,7 +240,7 @@ def test_labels_of_what_was_recorded_there_before_are_refused(rule, small_datase
     shutil.rmtree(tmp_path / "data")
     shorter = (np.arange(len(small_dataset)) % 20 > 3).tolist()
     relabelled(Path(small_dataset.root), tmp_path / "data", {"next.success": shorter})
-    with pytest.raises(FieldError, match=r"^file=.*: holds the labels of .*data, as it was then"):
+    with pytest.raises(FieldError, match=r"^file=.*: holds the labels of .*data with other episodes"):
         page_of(rule, open_dataset(tmp_path / "data"))
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lerobot.datasets.dataset_tools import remove_feature
 from lerobot.datasets.language import language_feature_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -87,6 +88,14 @@ def test_what_happened_between_two_kept_frames_belongs_to_the_first(
     assert np.ravel(rows["next.reward"]).tolist() == [2, 2, 2, 1, 2, 2]
     assert [round(float(dataset[row][CAMERA].mean()) * 255) for row in range(4)] == [0, 40, 80, 120]
     assert dataset.features["action"]["info"] == {"low": [-2, 0], "high": [2, 500]}
+
+
+def test_episodes_that_only_end_are_no_successes(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    remove_feature(open_dataset(source), "next.success", output_dir=tmp_path / "ends", repo_id="local/ends")
+    resample(monkeypatch, f"--dataset.root={tmp_path / 'ends'}", f"--output_dir={tmp_path / 'slow'}")
+    assert "Success holds" not in capsys.readouterr().out
 
 
 def test_depth_is_refused(make_synthetic_dataset: Any, tmp_path: Path, monkeypatch, capsys) -> None:

@@ -27,7 +27,7 @@ from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerCon
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
 from lerobot_wmrl.world_models.success import SuccessClassifier
 from lerobot_wmrl.world_models.text import ByteTextEncoder
-from lerobot_wmrl.world_models.training_data import decide_on_instructions, make_sampler
+from lerobot_wmrl.world_models.training_data import decide_on_instructions, make_joint_sampler, make_sampler
 from tests.trained import (
     CLIP_LENGTH,
     PULL,
@@ -300,7 +300,9 @@ def test_an_instruction_that_cannot_be_read_is_named_before_training(
     assert "success is told without the instructions, one of which cannot be read: task=" in caplog.text
 
 
-def test_so_is_that_of_an_episode_that_is_held_out(make_synthetic_dataset, trained, tmp_path, monkeypatch):
+def test_so_is_that_of_an_episode_that_is_held_out(
+    make_synthetic_dataset, two_tasks, trained, tmp_path, monkeypatch
+):
     """It is measured on when the training is over."""
     root = make_synthetic_dataset(tmp_path / "odd", episodes=2, instructions=(PUSH, "x" * 600)).root
     monkeypatch.setattr(EpisodeTable, "validation", property(lambda table: np.arange(len(table.start)) == 1))
@@ -310,6 +312,10 @@ def test_so_is_that_of_an_episode_that_is_held_out(make_synthetic_dataset, train
     with pytest.raises(FieldError, match=r"dataset\.root=.*odd: task=.*`tokenizer\.instructions`=false"):
         make_sampler(model, table, None, batch_size=2, seed=0)
     assert len(make_sampler(model, table, [0], batch_size=2, seed=0).episodes) == 1
+    more = TrainingData(str(two_tasks.root), more=[str(root)])
+    make_joint_sampler(
+        model, read_episodes(two_tasks), more, batch_size=2, seed=0
+    )  # measured on the first alone
 
 
 def test_an_evaluation_names_it_before_it_replays(
