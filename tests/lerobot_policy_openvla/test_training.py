@@ -31,7 +31,7 @@ from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
-from lerobot_wmrl.improve.findings import look
+from lerobot_wmrl.improve.findings import inspect_dataset
 from lerobot_wmrl.improve.plan import Plan
 from lerobot_wmrl.improve.progress import Progress
 from lerobot_wmrl.scripts.convert_openvla import ConvertOpenVLAConfig, convert
@@ -133,7 +133,7 @@ def test_adapters_are_trained_further_as_the_command_improve_does_it(
         policy=read_policy_config(str(tuned), []), dataset=ChosenEpisodes(str(small_dataset.root)),
         size="tiny", output_dir=tmp_path,
     )  # fmt: skip
-    found = look(read_episodes(small_dataset), config.policy, None)
+    found = inspect_dataset(read_episodes(small_dataset), config.policy, None)
     command = commands_of(Progress(Plan(config, found)), "cloned")["cloned"]
     run_here(*command, "--policy.device=cpu", "--steps=2", "--save_freq=2")
     before, after = (load_file(folder / LAST / ADAPTERS) for folder in (tuned, tmp_path / "cloned"))
