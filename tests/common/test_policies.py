@@ -157,6 +157,8 @@ def test_a_policy_of_targets_is_refused_where_actions_are_displacements(tmp_path
         check_units(config, SimpleNamespace(steps=[step]), names, low, -low)
     step.stats["action"]["std"] = torch.tensor([6.0, 10.0, 0.5])
     check_units(config, SimpleNamespace(steps=[step]), names, low, -low)
+    step.stats["action"]["std"] = torch.tensor([30.0, 3.0, 0.5])
+    check_units(config, SimpleNamespace(steps=[step]), names, low, -low)  # one of two
     step.stats["action"]["std"] = torch.tensor([2.0, 3e-3, 2e-7])
     at_rest = torch.tensor([-6.0, 1.185, 30.0])
     step.stats["action"]["mean"] = at_rest

@@ -237,7 +237,7 @@ def test_selection_gate_and_dyna_have_seeds_of_their_own() -> None:
     training = {first_seed(seed, i, 64) + 63 for seed in (0, 999_999) for i in (0, 9, 15_000, 15_624)}
     assert max(training) < EVALUATION_SEED
     assert EVALUATION_SEED < SELECTION_SEED < GATE_SEED
-    places = (0, 50, 2_000_000)
+    places = (0, 50, 2_000_000, DYNA_SEEDS - 10, GATE_SEEDS - 10)
     for first_of, first, end in (
         (dyna_seed, EVALUATION_SEED - DYNA_SEEDS, EVALUATION_SEED),
         (gate_seed, GATE_SEED, GATE_SEED + GATE_SEEDS),
