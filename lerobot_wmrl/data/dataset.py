@@ -223,8 +223,10 @@ def open_rows(repo_id: str, episodes: Collection[int] | None, **where: Any) -> L
     open_videos_of = partial(LeRobotDataset, repo_id, video_backend=VIDEO_BACKEND, **where)
     if episodes is None:
         return open_videos_of()
+    if not episodes:
+        raise FieldError("dataset.episodes", [], "chooses no episode", "leave it out for all")
     meta = LeRobotDatasetMetadata(repo_id, **where)
-    require_episodes(episodes, meta.total_episodes, meta.root)
+    require_episodes("dataset.episodes", episodes, meta.total_episodes, meta.root)
     dataset = open_videos_of(episodes=list(episodes))
     if missing_files(dataset.root, episodes):
         snapshot_download(

@@ -128,7 +128,7 @@ class EpisodeTable:
         """Mark the episodes that are `chosen`, all if None. FieldError names one that does not exist. (E,)"""
         indices = np.arange(len(self.start))
         if chosen:
-            require_episodes(chosen, len(indices), self.dataset.root)
+            require_episodes("dataset.episodes", chosen, len(indices), self.dataset.root)
         return indices >= 0 if chosen is None else np.isin(indices, chosen)
 
     def training(self, chosen: Sequence[int] | None) -> np.ndarray:
@@ -138,15 +138,13 @@ class EpisodeTable:
         return marked
 
 
-def require_episodes(chosen: Collection[int], total: int, root: Path) -> None:
-    """Raise FieldError unless episodes are chosen, and a dataset of so many in all has them."""
-    if not chosen:
-        raise FieldError("dataset.episodes", [], "chooses no episode", "leave it out for all")
+def require_episodes(name: str, chosen: Collection[int], total: int, root: Path) -> None:
+    """Raise FieldError about the setting `name` unless a dataset of `total` episodes has those `chosen`."""
     for episode in chosen:
         if not 0 <= episode < total:
             raise FieldError(
-                "dataset.episodes", list(chosen), f"there is no episode {episode} in {root}",
-                f"it has episodes 0 to {total - 1}",
+                name, chosen if isinstance(chosen, dict) else list(chosen),
+                f"there is no episode {episode} in {root}", f"it has episodes 0 to {total - 1}",
             )  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """What counts as success in a dataset that does not say so. N frames, E episodes."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -9,6 +9,7 @@ from draccus import ChoiceRegistry
 
 from lerobot_wmrl.common.constants import DONE_FRAMES
 from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.data.episodes import require_episodes
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -49,7 +50,7 @@ class EndsRule(SuccessRule):
         episode, frame, length = frame_positions(dataset)
         solved = frame >= length - self.last
         if self.episodes is not None:
-            require_episodes("episodes", self.episodes, dataset)
+            require_episodes("episodes", self.episodes, dataset.meta.total_episodes, dataset.root)
             solved &= np.isin(episode, self.episodes)
         return next_frame_solved(solved, dataset)
 
@@ -73,7 +74,7 @@ class FirstFramesRule(SuccessRule):
                 "first", None, "names no episode that succeeds", "name those that do, or {} if none does"
             )
         numbers = whole_numbers("first", self.first)
-        require_episodes("first", numbers, dataset)
+        require_episodes("first", numbers, dataset.meta.total_episodes, dataset.root)
         solved = np.zeros(len(episode), bool)
         for index, first in numbers.items():
             begin, end = np.searchsorted(episode, (index, index + 1))
@@ -197,17 +198,6 @@ def duration_lines(runs: Sequence[int]) -> list[str]:
             f"in lerobot-wmrl-train and --done_frames={held.min()} in lerobot-wmrl-eval-world-model."
         )
     return lines
-
-
-def require_episodes(name: str, episodes: Collection[int], dataset: "LeRobotDataset") -> None:
-    """Raise FieldError unless the dataset has them."""
-    value = episodes if isinstance(episodes, dict) else list(episodes)
-    wrong = [each for each in episodes if not 0 <= each < dataset.meta.total_episodes]
-    if wrong:
-        raise FieldError(
-            name, value, f"there is no episode {wrong[0]} in {dataset.root}",
-            f"it has episodes 0 to {dataset.meta.total_episodes - 1}",
-        )  # fmt: skip
 
 
 def reach(values: np.ndarray, threshold: float) -> np.ndarray:
