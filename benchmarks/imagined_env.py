@@ -16,6 +16,8 @@ def add_world_models(parser: argparse.ArgumentParser) -> None:
 def world_model_env(given: argparse.Namespace, **settings: Any) -> WorldModelEnv:
     """Make the environment of the flags, with further settings."""
     return WorldModelEnv(
-        world_model_path=given.world_model, text_world_model_path=given.text_world_model,
-        dataset=StartFrames(root=given.root), **settings,
-    )  # fmt: skip
+        world_model_path=given.world_model,
+        text_world_model_path=given.text_world_model,
+        dataset=StartFrames(root=given.root),
+        **settings,
+    )

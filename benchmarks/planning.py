@@ -54,13 +54,15 @@ def measure(model: ActionWorldModelRewardModel, searches: int, matmul: float) ->
     each = frames[torch.arange(searches, device=device).repeat_interleave(near.samples)]
     works: dict[str, tuple[float, Work]] = {
         "open_loop": (
-            len(sequences) * near.horizon, lambda: model.open_loop(frames, sequences, with_tokens=False)
+            len(sequences) * near.horizon,
+            lambda: model.open_loop(frames, sequences, with_tokens=False),
         ),
         "frame_by_frame": (len(sequences) * near.horizon, lambda: model.imagine(each, sequences)),
         "policy_actions": (
-            searches, lambda: model.policy_actions(frames, lambda *seen: action, near.horizon)
+            searches,
+            lambda: model.policy_actions(frames, lambda *seen: action, near.horizon),
         ),
-    }  # fmt: skip
+    }
     for name, settings in SETTINGS.items():
         planner = Planner(model, None, settings, 2, averaged=False, low=low, high=high, seed=0)
         proposed = None if name == "wm_mpc" else action[:, None].expand(-1, settings.horizon, -1)

@@ -75,9 +75,10 @@ def summary(durations: list[float]) -> dict[str, float]:
     """Return quantiles in milliseconds, and frames a second."""
     p50, p99 = np.quantile(durations, [0.5, 0.99])
     return {
-        "p50_ms": round(float(p50), 1), "p99_ms": round(float(p99), 1),
+        "p50_ms": round(float(p50), 1),
+        "p99_ms": round(float(p99), 1),
         "frames_per_s": round(1000 / float(np.mean(durations)), 1),
-    }  # fmt: skip
+    }
 
 
 async def page_steps(socket: aiohttp.ClientWebSocketResponse, actions: int, count: int) -> list[float]:
@@ -200,9 +201,10 @@ def main() -> None:
     register_third_party_plugins()
     given = make_parser().parse_args()
     env = DrivenEnv(
-        world_model_path=given.world_model, episode_length=10_000,
+        world_model_path=given.world_model,
+        episode_length=10_000,
         done_frames=10_000,
-    )  # fmt: skip
+    )
     world = load_world(env, DatasetSource(given.root), None, None)
     figures = {
         "threads": torch.get_num_threads(),

@@ -47,10 +47,14 @@ def cpu_seconds(step: Callable[[], object], steps: int) -> float:
 def stock_step(image_size: int, steps: int) -> float:
     """ManiSkill's own environment, with the pictures of both its cameras as numpy arrays."""
     env = gym.make(
-        "PushCube-v1", robot_uids="panda_wristcam", obs_mode="rgb", control_mode="pd_ee_delta_pose",
-        sensor_configs={"width": image_size, "height": image_size}, sim_backend="physx_cpu",
+        "PushCube-v1",
+        robot_uids="panda_wristcam",
+        obs_mode="rgb",
+        control_mode="pd_ee_delta_pose",
+        sensor_configs={"width": image_size, "height": image_size},
+        sim_backend="physx_cpu",
         render_backend=render_backend(),
-    )  # fmt: skip
+    )
     env.reset(seed=0)
     still = np.zeros(env.action_space.shape, np.float32)
 

@@ -56,10 +56,14 @@ def stock() -> float:
     backend = render_backend()
     began = time.process_time()
     env = gym.make(
-        "PushCube-v1", robot_uids="panda_wristcam", obs_mode="rgb", control_mode="pd_ee_delta_pose",
-        sensor_configs={"width": IMAGE_SIZE, "height": IMAGE_SIZE}, sim_backend="physx_cpu",
+        "PushCube-v1",
+        robot_uids="panda_wristcam",
+        obs_mode="rgb",
+        control_mode="pd_ee_delta_pose",
+        sensor_configs={"width": IMAGE_SIZE, "height": IMAGE_SIZE},
+        sim_backend="physx_cpu",
         render_backend=backend,
-    )  # fmt: skip
+    )
     observation, _ = env.reset(seed=0)
     assert len([data["rgb"].cpu().numpy() for data in observation["sensor_data"].values()]) == 2
     return time.process_time() - began

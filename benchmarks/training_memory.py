@@ -77,13 +77,18 @@ def measured(preset: str, kind: str, steps: int) -> dict[str, Any]:
     if not all(map(math.isfinite, losses)):
         raise ValueError(f"{preset}, {kind}: losses {losses}")
     return {
-        "preset": preset, "model": kind, "batch_size": config.batch_size, "trained parameters": count,
+        "preset": preset,
+        "model": kind,
+        "batch_size": config.batch_size,
+        "trained parameters": count,
         "tokens a frame": model.tokenizer.tokens_per_frame,
-        "fixed": in_gb(fixed), "activations of a sample": in_gb(a_sample),
-        "activations": in_gb(activations), "in training": in_gb(fixed + activations),
+        "fixed": in_gb(fixed),
+        "activations of a sample": in_gb(a_sample),
+        "activations": in_gb(activations),
+        "in training": in_gb(fixed + activations),
         "losses": [round(loss, 3) for loss in losses],
         "seconds a step and sample": round((time.perf_counter() - began) / steps / small, 1),
-    }  # fmt: skip
+    }
 
 
 def in_gb(size: int) -> float:

@@ -146,9 +146,17 @@ def random_clip(model: WorldModelRewardModel, batch: int, device: torch.device) 
     if model.config.predicts_success:
         features = torch.zeros(*shape, num_features(model.tokenizer.num_cameras), device=device)
     return Clip(
-        tokens, state, action, done, yes, yes, ["push the cube"] * batch, depth,
-        black_context(model, batch, device), features,
-    )  # fmt: skip
+        tokens,
+        state,
+        action,
+        done,
+        yes,
+        yes,
+        ["push the cube"] * batch,
+        depth,
+        black_context(model, batch, device),
+        features,
+    )
 
 
 def preset_config(preset: str, kind: str, flags: Sequence[str] = ()) -> TrainWorldModelConfig:

@@ -118,9 +118,10 @@ def maniskill_rates(image_size: int, cameras: list[str]) -> dict[str, float]:
         env.reset(seed=[1_000_000])
         simulation, still = env.unwrapped.envs[0].unwrapped, env.single_action_space.sample() * 0
         open_envs.append(env)
-        works[name] = (STEPS, lambda simulation=simulation, still=still: [
-            simulation.step(still) for _ in range(STEPS)
-        ])  # fmt: skip
+        works[name] = (
+            STEPS,
+            lambda simulation=simulation, still=still: [simulation.step(still) for _ in range(STEPS)],
+        )
     found = rates(works, torch.device("cpu"))
     for env in open_envs:
         env.close()

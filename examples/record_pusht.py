@@ -153,9 +153,13 @@ class ScriptedPusher:
 def record(root: Path, num_episodes: int, seed: int, noise: list[float], steps: int) -> None:
     """Record the episodes and print how many succeed."""
     env = gym.make(
-        "gym_pusht/PushT-v0", obs_type="pixels_agent_pos", observation_width=SIZE, observation_height=SIZE,
-        max_episode_steps=steps, disable_env_checker=True,
-    )  # fmt: skip
+        "gym_pusht/PushT-v0",
+        obs_type="pixels_agent_pos",
+        observation_width=SIZE,
+        observation_height=SIZE,
+        max_episode_steps=steps,
+        disable_env_checker=True,
+    )
     dataset = LeRobotDataset.create("local/pusht", fps=10, features=FEATURES, root=root, use_videos=False)
     successes = 0
     for episode in trange(num_episodes, unit="episode"):
@@ -166,15 +170,17 @@ def record(root: Path, num_episodes: int, seed: int, noise: list[float], steps: 
             action = pusher.act()
             after, reward, success, truncated, _ = env.step(action)
             done = success or truncated
-            dataset.add_frame({
-                "observation.image": observation["pixels"],
-                "observation.state": observation["agent_pos"].astype(np.float32),
-                "action": action,
-                "next.reward": np.array([reward], np.float32),
-                "next.success": np.array([success]),
-                "next.done": np.array([done]),
-                "task": "Push the T onto its outline.",
-            })  # fmt: skip
+            dataset.add_frame(
+                {
+                    "observation.image": observation["pixels"],
+                    "observation.state": observation["agent_pos"].astype(np.float32),
+                    "action": action,
+                    "next.reward": np.array([reward], np.float32),
+                    "next.success": np.array([success]),
+                    "next.done": np.array([done]),
+                    "task": "Push the T onto its outline.",
+                }
+            )
             observation = after
         dataset.save_episode()
         successes += int(success)

@@ -3,10 +3,10 @@
 from typing import Final
 
 from experiments.cells import Load
+from experiments.controls_section import controls
 from experiments.from_one_policy import changes, tables
 from experiments.study import ROOT, read_cells
 from experiments.value_cells import SCENES, against, groups, published
-from experiments.value_sections import controls
 from lerobot_wmrl.common.files import markdown_table as table
 
 STUDY: Final = "value_act"

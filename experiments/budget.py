@@ -23,9 +23,10 @@ COMMANDS: Final = ("lerobot-wmrl-record", "lerobot-wmrl-train", "lerobot-wmrl-tr
 """Commands that are given the ledger."""
 
 MODULES: Final = (
-    "lerobot_dataset_maniskill.record", "lerobot_wmrl.scripts.train",
+    "lerobot_dataset_maniskill.record",
+    "lerobot_wmrl.scripts.train",
     "lerobot_wmrl.scripts.train_world_model",
-)  # fmt: skip
+)
 """The same, as `torchrun -m` starts them."""
 
 ROOTS: Final = ("dataset.root", "env.dataset.root", "gate.dataset.root")

@@ -164,9 +164,11 @@ def make_parser() -> argparse.ArgumentParser:
         "--sizes", type=int, nargs="+", default=[64, 128], choices=WIDTHS, help="pixels a side"
     )
     parser.add_argument(
-        "--cameras", nargs="+", default=[*CANDIDATES, "wrist"],
+        "--cameras",
+        nargs="+",
+        default=[*CANDIDATES, "wrist"],
         help="what is probed: cameras, or several together, as in front_steep+wrist",
-    )  # fmt: skip
+    )
     parser.add_argument("--output", type=Path, required=True, help="JSON file to add to")
     parser.add_argument(
         "--frames", type=Path, default=Path("outputs/camera_frames"), help="folder that keeps the frames"

@@ -85,19 +85,30 @@ def quantizers(cells: Sequence[Cell]) -> str:
     """Return a table with a line for each seed, kind of scenes and quantizer."""
     rows = [
         [
-            cell["seed"], DOMAINS[domain], title, used(gate["tokenizer"]),
-            estimate(gate["headline"]["psnr_ceiling"]), estimate(gate["headline"]["delta_psnr_0_6s"]),
+            cell["seed"],
+            DOMAINS[domain],
+            title,
+            used(gate["tokenizer"]),
+            estimate(gate["headline"]["psnr_ceiling"]),
+            estimate(gate["headline"]["delta_psnr_0_6s"]),
             *told(gate),
         ]
         for cell in cells
         for domain in SCENES
         for kind, title in QUANTIZERS.items()
         for gate in [cell["gates"][kind][domain]]
-    ]  # fmt: skip
+    ]
     columns = [
-        "seed", "scenes", "codes", "codes used", "tokenizer's PSNR (dB)", "delta-PSNR after 0.6 s (dB)",
-        "false positives", "recall", "AUC",
-    ]  # fmt: skip
+        "seed",
+        "scenes",
+        "codes",
+        "codes used",
+        "tokenizer's PSNR (dB)",
+        "delta-PSNR after 0.6 s (dB)",
+        "false positives",
+        "recall",
+        "AUC",
+    ]
     return table(columns, rows)
 
 

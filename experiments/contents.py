@@ -7,6 +7,7 @@ from typing import Final, NamedTuple
 from experiments import (
     act_section,
     codes_section,
+    controls_section,
     foreign,
     four_tasks_section,
     judged,
@@ -61,7 +62,9 @@ CHAPTERS: Final[Mapping[str, Mapping[str, Section]]] = {
             "Distillation after PPO", partial(value.rows_above, ["ppo_distilled"])
         ),
         "value_time_limit": Section("Twice as many steps an episode", codes_section.time_limit),
-        "value_controls": Section("Wrong labels, wrong actions, fewer episodes", value.value_controls),
+        "value_controls": Section(
+            "Wrong labels, wrong actions, fewer episodes", controls_section.value_controls
+        ),
         "driven": Section("Demonstrations that somebody drives in a world model", policies.driven),
     },
     "Other tasks": {

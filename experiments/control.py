@@ -53,11 +53,20 @@ class Training(NamedTuple):
 
 
 CARTPOLE: Final[dict[str, Any]] = {
-    **FREE, "policy_lr": 2e-3, "minibatch_size": 512, "epochs": 6, "target_kl": 0.03,
-}  # fmt: skip
+    **FREE,
+    "policy_lr": 2e-3,
+    "minibatch_size": 512,
+    "epochs": 6,
+    "target_kl": 0.03,
+}
 PENDULUM: Final[dict[str, Any]] = {
-    **FREE, "policy_lr": 1e-3, "minibatch_size": 400, "epochs": 8, "gamma": 0.95, "target_kl": 0.05,
-}  # fmt: skip
+    **FREE,
+    "policy_lr": 1e-3,
+    "minibatch_size": 400,
+    "epochs": 8,
+    "gamma": 0.95,
+    "target_kl": 0.05,
+}
 
 TRAININGS: Final = {
     "cartpole-ppo": Training(
@@ -79,9 +88,11 @@ class ControlEnv(TensorEnv):
 
     def __init__(self, task: str, num_envs: int) -> None:
         self.envs = gym.make_vec(
-            task, num_envs, vectorization_mode="sync",
+            task,
+            num_envs,
+            vectorization_mode="sync",
             vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
-        )  # fmt: skip
+        )
         self.num_envs, self.single_action_space = num_envs, self.envs.single_action_space
         self.max_episode_steps, self.device = gym.spec(task).max_episode_steps, torch.device("cpu")
         space = self.single_action_space
@@ -107,9 +118,13 @@ class ControlEnv(TensorEnv):
             last[row] = info["final_obs"][row]
         terminated, truncated = (torch.from_numpy(end) for end in ends)
         return Outcome(
-            self._observe(last), torch.from_numpy(reward).float(), terminated, truncated, truncated,
+            self._observe(last),
+            torch.from_numpy(reward).float(),
+            terminated,
+            truncated,
+            truncated,
             self.elapsed,
-        )  # fmt: skip
+        )
 
     def _restart(self, ended: Tensor, outcome: Outcome) -> Observation:
         self.elapsed = self.elapsed.masked_fill(ended, 0)
@@ -209,9 +224,14 @@ def measure(training: Training, iterations: int, seed: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         algorithm = make_algorithm(policy, training.config, Path(folder))
         train(
-            env, algorithm, pipeline, buffer, Schedule(iterations, iterations, 1000 * seed), Path(folder),
+            env,
+            algorithm,
+            pipeline,
+            buffer,
+            Schedule(iterations, iterations, 1000 * seed),
+            Path(folder),
             lambda path: path.mkdir(parents=True),
-        )  # fmt: skip
+        )
     seconds = time.process_time() - began
     env.close()
     return {

@@ -41,10 +41,12 @@ def _draw_curves(axes: Axes, results: Mapping[str, Any], abscissa: str, unit: fl
     axes.axhspan(*cloned["wilson_95"], color="#999", alpha=0.2)
     axes.axhline(cloned["share"], color="#666", linestyle="--", label="SFT")
     for colour, (place, title) in zip(COLOURS, PLACES.items(), strict=False):
-        curves = np.array([
-            [(0.0, cloned["share"]), *((point[abscissa] * unit, point["share"]) for point in run["ind"])]
-            for run in results["runs"][place]
-        ])  # fmt: skip
+        curves = np.array(
+            [
+                [(0.0, cloned["share"]), *((point[abscissa] * unit, point["share"]) for point in run["ind"])]
+                for run in results["runs"][place]
+            ]
+        )
         for curve in curves:
             axes.plot(*curve.T, color=colour, alpha=0.35, linewidth=1)
         axes.plot(*curves.mean(0).T, color=colour, marker="o", label=title)
@@ -67,10 +69,14 @@ def draw_improvement(found: Mapping[str, Any], path: Path, kinds: Mapping[str, s
             for place, row in enumerate(groups.values()):
                 rate = Proportion.from_json(row[kind])
                 axes.bar(
-                    place + width / len(kinds) * number, rate.share, 0.88 * width / len(kinds),
-                    yerr=rate.whiskers, capsize=3, color=PALETTE[number],
+                    place + width / len(kinds) * number,
+                    rate.share,
+                    0.88 * width / len(kinds),
+                    yerr=rate.whiskers,
+                    capsize=3,
+                    color=PALETTE[number],
                     label=title if place == 0 and domain == list(found)[-1] else None,
-                )  # fmt: skip
+                )
         middle = width / 2 * (1 - 1 / len(kinds))
         axes.set_xticks([place + middle for place in range(len(groups))], list(groups))
         axes.set_title(DOMAINS[domain])
@@ -107,9 +113,15 @@ def draw_judged(found: Mapping[str, Any], path: Path) -> None:
         for row in numbers["policies"].values():
             imagined, real = (Proportion.from_json(row[kind]) for kind in ("imagined", "real"))
             axes.errorbar(
-                imagined.share, real.share, real.whiskers, imagined.whiskers, linewidth=0.7,
-                color=COLOURS[1 if row["inside"] else 0], marker="x" if row["inside"] else "o", markersize=4,
-            )  # fmt: skip
+                imagined.share,
+                real.share,
+                real.whiskers,
+                imagined.whiskers,
+                linewidth=0.7,
+                color=COLOURS[1 if row["inside"] else 0],
+                marker="x" if row["inside"] else "o",
+                markersize=4,
+            )
         axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), title=DOMAINS[domain])
         axes.set_xlabel("success in the world model (crosses: trained in it)")
     panels[0].set_ylabel("success in ManiSkill")

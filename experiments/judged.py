@@ -166,9 +166,12 @@ def compatible(row: Row) -> bool:
 
 
 def by_scene(
-    domain: str, imagined: Mapping[str, Sequence[bool]], real: Mapping[str, Sequence[bool]],
-    seeds: Sequence[int], policies: Sequence[str],
-) -> dict[str, Any]:  # fmt: skip
+    domain: str,
+    imagined: Mapping[str, Sequence[bool]],
+    real: Mapping[str, Sequence[bool]],
+    seeds: Sequence[int],
+    policies: Sequence[str],
+) -> dict[str, Any]:
     """Return imagined and real success of all `policies` together, by scene."""
     scenes = SCENES[domain]
 
@@ -182,11 +185,14 @@ def by_scene(
     seen, happened = rates(imagined, range(starts)), rates(real, seeds)
     return {
         str(each.index): {
-            "object": each.object, "container": each.container, "table": each.table,
-            "imagined": seen[each.index].as_json(), "real": happened[each.index].as_json(),
+            "object": each.object,
+            "container": each.container,
+            "table": each.table,
+            "imagined": seen[each.index].as_json(),
+            "real": happened[each.index].as_json(),
         }
         for each in scenes
-    }  # fmt: skip
+    }
 
 
 def section(load: Load) -> str:
@@ -198,7 +204,9 @@ def section(load: Load) -> str:
     starts = [next(iter(each["policies"].values()))["real"]["n"] for each in found.values()]
     rows = [
         [
-            DOMAINS[domain], title, f"{row['n']} ({row['trainings']})",
+            DOMAINS[domain],
+            title,
+            f"{row['n']} ({row['trainings']})",
             *(f"{100 * row[kind]['absolute']:.0f} ({100 * row[kind]['mean']:+.0f})" for kind in ESTIMATES),
             *("–" if row["n"] < FEW else f"{row[name]:.2f}" for name in ("pearson", "kendall")),
             *(f"{row[name]['k']} of {row[name]['n']}" for name in ("by_rollouts", "by_references")),
@@ -206,7 +214,7 @@ def section(load: Load) -> str:
         ]
         for domain, each in found.items()
         for title, row in (("no", each["outside"]), ("yes", each["inside"]))
-    ]  # fmt: skip
+    ]
     unexplained = [each["unexplained"] for each in found.values()]
     known_scenes, unseen_scenes = (each["scenes"].values() for each in found.values())
     outside, counts = known["outside"], [known["recall"], known["false_positive_rate"]]
@@ -254,10 +262,16 @@ GOOD: Final = 0.5
 
 ESTIMATES: Final = ("imagined", "corrected", "calibrated")
 HEAD: Final = (
-    "scenes", "trained in the world model", "checkpoints (trainings)",
-    *(f"{kind}: points off" for kind in ESTIMATES), "Pearson's r", "Kendall's τ",
-    "intervals by rollouts hold", "intervals by references hold", "their width (points)",
-)  # fmt: skip
+    "scenes",
+    "trained in the world model",
+    "checkpoints (trainings)",
+    *(f"{kind}: points off" for kind in ESTIMATES),
+    "Pearson's r",
+    "Kendall's τ",
+    "intervals by rollouts hold",
+    "intervals by references hold",
+    "their width (points)",
+)
 
 
 def differing(scenes: Collection[Mapping[str, Any]]) -> str:

@@ -78,10 +78,16 @@ def rl_comparison(load: Load) -> str:
             minutes = sum(
                 next(p for p in run["ind"] if p["env_steps"] == steps)["seconds"] for run in runs
             ) / (60 * len(runs))
-            rows.append([
-                {"imagined": "world model", "simulated": "ManiSkill"}[place], DOMAINS[domain], f"{steps:,}",
-                f"{minutes:.0f}", percents(rates), points(mean),
-            ])  # fmt: skip
+            rows.append(
+                [
+                    {"imagined": "world model", "simulated": "ManiSkill"}[place],
+                    DOMAINS[domain],
+                    f"{steps:,}",
+                    f"{minutes:.0f}",
+                    percents(rates),
+                    points(mean),
+                ]
+            )
     last, baseline = found["mean_change"]["imagined 60"], found["mean_change"]["simulated 20"]
     cloned = found["cloned"]
     return f"""It does, by {points(last["ind"])} in known scenes and {points(last["ood"])} in unseen ones. A
@@ -155,14 +161,18 @@ One world model. An episode takes about three seconds on one core; a plan imagin
 def synthetic_data(load: Load) -> str:
     found = load("synthetic_data")
     names = {
-        "cloned": "eight demonstrations", "imagined": "160 imagined successes of that policy",
+        "cloned": "eight demonstrations",
+        "imagined": "160 imagined successes of that policy",
         "simulated": "160 ManiSkill successes of that policy",
-    }  # fmt: skip
+    }
     rows = [
-        [title, *(share(found[kind][d]) for d in ("ind", "ood")),
-         "" if kind == "cloned" else paired(found[kind]["ind"]["from_cloned"])]
+        [
+            title,
+            *(share(found[kind][d]) for d in ("ind", "ood")),
+            "" if kind == "cloned" else paired(found[kind]["ind"]["from_cloned"]),
+        ]
         for kind, title in names.items()
-    ]  # fmt: skip
+    ]
     return f"""It does, and more than from ManiSkill's successes. An imagined success is stricter here (done
 probability of 0.95 in two consecutive frames); whether that explains the difference has not been tested.
 
@@ -190,10 +200,11 @@ def driven(load: Load) -> str:
         for name, title in DRIVEN.items():
             found = cell["methods"][name]
             rates = [
-                f"{100 * found[domain]['share']:.0f} %" if name == "driven_cloning"
+                f"{100 * found[domain]['share']:.0f} %"
+                if name == "driven_cloning"
                 else against(found[domain], reference[domain])
                 for domain in SCENES
-            ]  # fmt: skip
+            ]
             rows.append([cell["count"], title, cell["seed"], *rates])
     return f"""Policies cloned from as many demonstrations of each kind, on the same starts. Changes are
 against the first row:

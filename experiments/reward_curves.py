@@ -153,9 +153,11 @@ def measure(
             "earned_by": {hand: float(paid[name].mean()) for hand, paid in alone.items() if name in paid},
         }
     return {
-        "successes": int(success.sum()), "failures": int((~success).sum()), "rewards": by_reward,
+        "successes": int(success.sum()),
+        "failures": int((~success).sum()),
+        "rewards": by_reward,
         "uncertainty": warnings(uncertainty, Outcomes(np.arange(len(done)), lasted["success"], done)),
-    }  # fmt: skip
+    }
 
 
 def warnings(uncertainty: Mapping[str, np.ndarray], outcomes: Outcomes) -> dict[str, Any]:
@@ -194,11 +196,16 @@ def with_recorded_actions(
     episodes = chosen_episodes(table, source)
     env = make_world_model_env(
         WorldModelEnv(
-            world_model_path=given.model_path, text_world_model_path=given.text_model_path, dataset=source,
-            reward=reward, done_frames=NEVER, episode_length=NEVER,
+            world_model_path=given.model_path,
+            text_world_model_path=given.text_model_path,
+            dataset=source,
+            reward=reward,
+            done_frames=NEVER,
+            episode_length=NEVER,
         ),
-        len(episodes), "cpu",
-    )  # fmt: skip
+        len(episodes),
+        "cpu",
+    )
     steps = int(table.length[episodes].max())
     actions = Recording.read(table, env.model).actions(episodes, steps, torch.device("cpu"))
     return table, episodes, env, actions
@@ -212,8 +219,9 @@ def curves_of(given: argparse.Namespace, root: str, rewards: Mapping[str, Any]) 
     env.reward, steps = probe, actions.shape[1]
     column = np.asarray(table.dataset.hf_dataset.with_format("numpy")["next.reward"][:]).reshape(-1)
     curves = {
-        "rule_based": recorded(table, episodes, column, steps), **judged(env, probe, actions, config),
-    }  # fmt: skip
+        "rule_based": recorded(table, episodes, column, steps),
+        **judged(env, probe, actions, config),
+    }
     done = recorded(table, episodes, table.done, steps) == 1
     hands = {
         name: judged(env, probe, moves, config) for name, moves in other_hands((len(episodes), steps)).items()
@@ -227,10 +235,16 @@ def results_table(measured: Mapping[str, Mapping[str, Any]]) -> str:
     for dataset, numbers in measured.items():
         for name, row in numbers["rewards"].items():
             earned = [f"{row['earned_by'][hand]:.2f}" if hand in row["earned_by"] else "–" for hand in HANDS]
-            lines.append([
-                dataset, name, f"{row['auc']:.3f}", f"{row['spearman']['value']:.2f}",
-                f"{row['earned_by_successes']:.2f}", *earned,
-            ])  # fmt: skip
+            lines.append(
+                [
+                    dataset,
+                    name,
+                    f"{row['auc']:.3f}",
+                    f"{row['spearman']['value']:.2f}",
+                    f"{row['earned_by_successes']:.2f}",
+                    *earned,
+                ]
+            )
     return markdown_table(["episodes", "reward", "AUC", "Spearman", "successes earn", *HANDS], lines)
 
 

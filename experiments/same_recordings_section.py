@@ -19,7 +19,7 @@ from experiments.value_cells import (
     measured,
     minutes,
     shares,
-)  # fmt: skip
+)
 from lerobot_wmrl.common.files import markdown_table as table
 
 STUDY: Final = "value_same_recordings"

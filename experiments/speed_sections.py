@@ -68,8 +68,13 @@ def speed(load: Load) -> str:
     ]
     found = load("world_model_speed")
     faster = found["times_faster_than_maniskill"]
-    head = ["parallel episodes", "frames/s without decoding", "frames/s with decoding",
-            "frames/s without decoding or cache", "with decoding, share of the roofline"]  # fmt: skip
+    head = [
+        "parallel episodes",
+        "frames/s without decoding",
+        "frames/s with decoding",
+        "frames/s without decoding or cache",
+        "with decoding, share of the roofline",
+    ]
     recording, rate, ppo = load("recording_speed"), load("recording_rate"), load("ppo_speed")
     environment, start = load("environment_speed")["by_number"][-1], load("simulator_start")
     return f"""On two CPU cores 64 imaginations are {faster["stock meshes"]["64"]:.0f} times as fast as one
@@ -133,14 +138,17 @@ def speed_gpu(load: Load) -> str:
     ]
     updates = [
         [
-            computed["batch"], "on" if checkpointing else "off",
-            computed["SFT, checkpointing" if checkpointing else "SFT"], found["GB"], found["a second"],
+            computed["batch"],
+            "on" if checkpointing else "off",
+            computed["SFT, checkpointing" if checkpointing else "SFT"],
+            found["GB"],
+            found["a second"],
         ]
         for checkpointing in (False, True)
         for computed, found in zip(
             memory["updates"], measured["checkpointing" if checkpointing else "plain"], strict=True
         )
-    ]  # fmt: skip
+    ]
     decoding = measured["decoding"]
     return f"""The preset `gpu`'s action world model: {network["type"]}, {network["layers"]} layers of width
 {network["width"]}, {model["image_size"]} pixels, bfloat16, random weights. Frames a second on an
@@ -165,19 +173,33 @@ def training_memory(load: Load) -> str:
     """Return the section: memory that the presets' world models take in training."""
     found = load("training_memory")
     models = {
-        "frame_tokenizer": "frame tokenizer", "action_world_model": "action world model",
+        "frame_tokenizer": "frame tokenizer",
+        "action_world_model": "action world model",
         "text_world_model": "text world model",
-    }  # fmt: skip
+    }
     rows = [
         [
-            row["preset"], models[row["model"]], f"{row['trained parameters'] / 1e6:.1f}", row["batch_size"],
-            f"{row['fixed']:.2f}", f"{1000 * row['activations of a sample']:,.0f}",
-            f"{row['in training']:.1f}", f"{row['losses'][0]:.1f} → {row['losses'][-1]:.1f}",
+            row["preset"],
+            models[row["model"]],
+            f"{row['trained parameters'] / 1e6:.1f}",
+            row["batch_size"],
+            f"{row['fixed']:.2f}",
+            f"{1000 * row['activations of a sample']:,.0f}",
+            f"{row['in training']:.1f}",
+            f"{row['losses'][0]:.1f} → {row['losses'][-1]:.1f}",
         ]
         for row in found["models"]
-    ]  # fmt: skip
-    head = ["preset", "model", "trained parameters (millions)", "batch", "weights, gradients, moments (GB)",
-            "activations of a sample (MB)", "in training (GB)", "loss, four steps"]  # fmt: skip
+    ]
+    head = [
+        "preset",
+        "model",
+        "trained parameters (millions)",
+        "batch",
+        "weights, gradients, moments (GB)",
+        "activations of a sample (MB)",
+        "in training (GB)",
+        "loss, four steps",
+    ]
     return f"""Each preset's models with its sizes and cameras, random weights and random frames. What
 autograd keeps of a batch for the backward pass was counted at two small batches; it is linear in the batch.
 A sample is a frame, or a clip of the preset's length. Not counted: the workspace of kernels, and what an

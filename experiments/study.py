@@ -40,8 +40,16 @@ BUDGET: Final = "budget"
 ROOT: Final = Path(__file__).parents[1]
 OUTPUTS: Final = Path("outputs/experiments")
 KEYS: Final = {
-    "question", "needs", "extends", "budget", "variables", "cells", "steps", "collect", "results",
-}  # fmt: skip
+    "question",
+    "needs",
+    "extends",
+    "budget",
+    "variables",
+    "cells",
+    "steps",
+    "collect",
+    "results",
+}
 
 
 @dataclass(frozen=True)

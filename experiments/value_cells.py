@@ -35,10 +35,20 @@ TITLES: Final = {
 """Methods in the order of the table."""
 
 IMAGINED: Final = (
-    "imagined_ppo", "planned", "dyna", "iterated_ppo", "iterated_ppo_distilled", "imagined_cloning",
-    "distilled", "distilled_ppo", "ppo_distilled", "longer_imagined_ppo", "longer_ppo_distilled",
-    "discounted_ppo", "longer_discounted_ppo",
-)  # fmt: skip
+    "imagined_ppo",
+    "planned",
+    "dyna",
+    "iterated_ppo",
+    "iterated_ppo_distilled",
+    "imagined_cloning",
+    "distilled",
+    "distilled_ppo",
+    "ppo_distilled",
+    "longer_imagined_ppo",
+    "longer_ppo_distilled",
+    "discounted_ppo",
+    "longer_discounted_ppo",
+)
 """Methods that use a world model."""
 
 BASELINES: Final = tuple(method for method in TITLES if method not in IMAGINED)

@@ -59,6 +59,10 @@ def _draw_points(axes: Axes, found: Groups, method: str, domain: str, shift: flo
             means.append(RunsMean.over(runs))
     whiskers = [[mean.mean - mean.low for mean in means], [mean.high - mean.mean for mean in means]]
     return axes.errorbar(
-        places, [mean.mean for mean in means], whiskers, fmt="o", color=DRAWN[method],
+        places,
+        [mean.mean for mean in means],
+        whiskers,
+        fmt="o",
+        color=DRAWN[method],
         markerfacecolor=DRAWN[method] if method in IMAGINED else "white",
-    )  # fmt: skip
+    )

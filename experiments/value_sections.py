@@ -41,18 +41,6 @@ from experiments.value_cells import (
 )
 from lerobot_wmrl.common.files import markdown_table as table
 
-CONTROLLED: Final = ("imagined_ppo", "planned")
-"""Those that controls are made for."""
-
-UNCHANGED: Final = "all episodes"
-CONTROLS: Final = {
-    "labels": "all, each with the labels of another",
-    "actions": "all, each with the actions of another",
-    "rollouts_only": "rollouts alone",
-    "demonstrations_only": "demonstrations alone",
-}
-"""What a control's world model learnt from."""
-
 AIMED_GAIN: Final = 0.1
 """What was aimed at: how much more often methods with a world model succeed than those without one."""
 
@@ -135,12 +123,14 @@ def spoken(group: tuple[Any, ...]) -> str:
 
 def recorded_anew(found: Groups, method: str) -> str:
     """Return in which cells a method learnt from other episodes of the same budget than other rows."""
-    return listed([
-        f"{spoken(group)}, seed {cell['seed']} ({own} successes, the others {cell['real_successes']})"
-        for group, cells in found.items()
-        for cell in cells
-        if (own := cell["recorded_anew"].get(method)) is not None
-    ])  # fmt: skip
+    return listed(
+        [
+            f"{spoken(group)}, seed {cell['seed']} ({own} successes, the others {cell['real_successes']})"
+            for group, cells in found.items()
+            for cell in cells
+            if (own := cell["recorded_anew"].get(method)) is not None
+        ]
+    )
 
 
 def from_the_same_start(cells: Sequence[Cell]) -> str:
@@ -225,8 +215,9 @@ def comparison(found: Groups, by: Sequence[str] = REAL_EPISODES) -> str:
     rows = [
         [*group, title, *(shares(cells, method, domain) for domain in SCENES), minutes(cells, method)]
         for group, cells in found.items()
-        for method, title in TITLES.items() if method in measured(cells, TITLES)
-    ]  # fmt: skip
+        for method, title in TITLES.items()
+        if method in measured(cells, TITLES)
+    ]
     starts = len(outcomes(next(iter(found.values())), "cloning", "ind")[0])
     return f"""The best method with a world model against the best without one, on as many real episodes and
 the same starts:
@@ -251,11 +242,15 @@ def best_gains(found: Groups, by: Sequence[str]) -> str:
     for group, cells in found.items():
         for domain in SCENES:
             pair = best_pair(cells, domain)
-            rows.append([
-                *group, DOMAINS[domain], *(TITLES[method] for method in reversed(pair)),
-                points(asdict(gain(cells, *pair, domain))),
-                ", ".join(str(round(100 * each)) for each in gains(cells, *pair, domain)),
-            ])  # fmt: skip
+            rows.append(
+                [
+                    *group,
+                    DOMAINS[domain],
+                    *(TITLES[method] for method in reversed(pair)),
+                    points(asdict(gain(cells, *pair, domain))),
+                    ", ".join(str(round(100 * each)) for each in gains(cells, *pair, domain)),
+                ]
+            )
     return table([*by, "scenes", "best without", "best with", "gain", "by seed"], rows)
 
 
@@ -264,16 +259,19 @@ def trained_longer(found: Groups) -> str:
     longer = having(found, "longer_filtered")
     if not longer:
         return ""
-    which = listed([
-        f"{spoken(group)}, seed{'s' if len(cells) > 1 else ''} "
-        + ", ".join(str(cell["seed"]) for cell in cells)
-        for group, cells in longer.items()
-    ])  # fmt: skip
+    which = listed(
+        [
+            f"{spoken(group)}, seed{'s' if len(cells) > 1 else ''} "
+            + ", ".join(str(cell["seed"]) for cell in cells)
+            for group, cells in longer.items()
+        ]
+    )
     rises = [
         rise
-        for cells in longer.values() for domain in SCENES
+        for cells in longer.values()
+        for domain in SCENES
         for rise in gains(cells, "longer_filtered", "filtered", domain)
-    ]  # fmt: skip
+    ]
     left = ""
     if longer != found:
         left = f" What is left of the gains there:\n\n{best_gains(longer, REAL_EPISODES)}"
@@ -300,14 +298,18 @@ def from_longer(found: Groups) -> str:
     begun = ("longer_imagined_ppo", "longer_ppo_distilled", "longer_discounted_ppo")
     rows = [
         [
-            *group, DOMAINS[domain], TITLES[method], shares(own, "longer_filtered", domain),
-            shares(own, method, domain), points(asdict(gain(own, method, "longer_filtered", domain))),
+            *group,
+            DOMAINS[domain],
+            TITLES[method],
+            shares(own, "longer_filtered", domain),
+            shares(own, method, domain),
+            points(asdict(gain(own, method, "longer_filtered", domain))),
         ]
         for group, cells in having(found, "longer_filtered").items()
         for method in measured(cells, begun)
         for own in [[cell for cell in cells if method in cell["methods"]]]
         for domain in SCENES
-    ]  # fmt: skip
+    ]
     if not rows:
         return "PPO and the planner have not begun from it yet."
     columns = [*REAL_EPISODES, "scenes", "method", "longer BC", "after the method", "gain"]
@@ -354,27 +356,6 @@ PPO in which an episode is rewarded only if all its frames are done, against the
 {table([*BUDGET, "known scenes", "unseen scenes"], rows)}"""
 
 
-def value_controls(load: Load) -> str:
-    """Return the section: success under each control, against the policy before it on the same starts."""
-    rows = [
-        [
-            *budget,
-            learnt,
-            TITLES[method],
-            *(against(found[method][domain], before[domain]) for domain in SCENES),
-        ]
-        for cell, budget, before in improved(load)
-        for learnt, found in controls(load, cell)
-        for method in CONTROLLED
-    ]
-    return f"""Success against that of the policy which PPO begins from, on the same starts:
-
-{table([*BUDGET, "the world model learnt from", "method", "known scenes", "unseen scenes"], rows)}
-
-One seed. The distilled planner has controls [with ACT](#value_act_controls). PPO in a world model of the
-demonstrations alone is a [pilot](pilots.md#a-world-model-of-demonstrations-alone)."""
-
-
 def improved(load: Load) -> Iterator[tuple[str, list[Any], Cell]]:
     """Yield the published cells of the study: name, budget and seed, success of the policy before PPO."""
     for each in read_cells(ROOT / "experiments" / f"{STUDY}.yaml"):
@@ -382,12 +363,3 @@ def improved(load: Load) -> Iterator[tuple[str, list[Any], Cell]]:
         if cell := published(load, STUDY, name):
             budget = [cell["demonstrations"], cell["rollouts"], cell["seed"]]
             yield name, budget, cell["methods"][cell["start"]]
-
-
-def controls(
-    load: Load, cell: str, study: str = STUDY, controls_of: str = "value_controls"
-) -> list[tuple[str, Cell]]:
-    """Return what a cell's world models learnt from and the methods in them; none without a control."""
-    found = [(title, published(load, controls_of, f"{cell}_{name}")) for name, title in CONTROLS.items()]
-    changed = [(title, control["methods"]) for title, control in found if control]
-    return changed and [(UNCHANGED, load(f"{study}/{cell}")["methods"]), *changed]

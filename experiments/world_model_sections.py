@@ -179,17 +179,31 @@ def training_rows(variants: Mapping[str, Mapping[str, Any]]) -> str:
     """Return a table with a line a training."""
     rows = [
         [
-            name.rsplit("_", 1)[0].replace("_", " "), name.rsplit("_", 1)[1], f"{row['episodes']:,}",
-            f"{row['steps']:,}", f"{row['minutes']:.0f}", f"{row['parameters'] / 1e6:.1f} M",
-            estimate(row["delta_psnr_0_6s"]), estimate(row["moving_psnr"]), estimate(row["done_f1"], 2),
+            name.rsplit("_", 1)[0].replace("_", " "),
+            name.rsplit("_", 1)[1],
+            f"{row['episodes']:,}",
+            f"{row['steps']:,}",
+            f"{row['minutes']:.0f}",
+            f"{row['parameters'] / 1e6:.1f} M",
+            estimate(row["delta_psnr_0_6s"]),
+            estimate(row["moving_psnr"]),
+            estimate(row["done_f1"], 2),
             f"{row['gate']['auc']:.2f}",
         ]
         for name, row in variants.items()
-    ]  # fmt: skip
+    ]
     head = [
-        "training", "seed", "episodes", "steps", "minutes", "parameters", "delta-PSNR at 15 (dB)",
-        "PSNR of what moved (dB)", "done F1", "AUC of the gate",
-    ]  # fmt: skip
+        "training",
+        "seed",
+        "episodes",
+        "steps",
+        "minutes",
+        "parameters",
+        "delta-PSNR at 15 (dB)",
+        "PSNR of what moved (dB)",
+        "done F1",
+        "AUC of the gate",
+    ]
     return table(head, rows)
 
 
@@ -232,15 +246,28 @@ def text_dynamics(load: Load) -> str:
         if name == "provenance":
             continue
         kind, steps, seed = name.split("_")
-        rows.append([
-            kind, f"{int(steps):,}", seed, counted(row["success_holds"]),
-            f"{row['nearest_final_tokenizer_lpips']['value']:.2f}", estimate(row["auc"], 2),
-            f"{row['auc_of_other_starts']['value']:.2f}",
-        ])  # fmt: skip
+        rows.append(
+            [
+                kind,
+                f"{int(steps):,}",
+                seed,
+                counted(row["success_holds"]),
+                f"{row['nearest_final_tokenizer_lpips']['value']:.2f}",
+                estimate(row["auc"], 2),
+                f"{row['auc_of_other_starts']['value']:.2f}",
+            ]
+        )
     example = next(row for name, row in load("text_dynamics").items() if name != "provenance")
     probe, finals = example["probe"]["balanced_accuracy"], 100 * example["success_holds_in_finals"]["share"]
-    head = ["dynamics", "steps", "seed", "success holds in the goal frame", "distance to the nearest final",
-            "AUC of the similarity", "AUC with other starts' goal frames"]  # fmt: skip
+    head = [
+        "dynamics",
+        "steps",
+        "seed",
+        "success holds in the goal frame",
+        "distance to the nearest final",
+        "AUC of the similarity",
+        "AUC with other starts' goal frames",
+    ]
     return f"""Anchored ones. After 400 steps, which take either kind about two minutes of one core, success
 holds in most of their goal frames, and recorded successes end more similar to them than failures do. With
 four times the training the difference is small. So the text world model is anchored by default.
@@ -270,16 +297,23 @@ def reward_curves(load: Load) -> str:
         if name == "rule_based":
             continue
         earned = [f"{row['earned_by'][hand]:.2f}" for hand in ("random", "frozen", "saturated")]
-        rows.append([
-            REWARDS.get(name, name),
-            f"{row['auc']:.2f}, {unseen[name]['auc']:.2f}",
-            f"{row['spearman']['value']:.2f}, {unseen[name]['spearman']['value']:.2f}",
-            f"{row['earned_by_successes']:.2f}", ", ".join(earned),
-        ])  # fmt: skip
+        rows.append(
+            [
+                REWARDS.get(name, name),
+                f"{row['auc']:.2f}, {unseen[name]['auc']:.2f}",
+                f"{row['spearman']['value']:.2f}, {unseen[name]['spearman']['value']:.2f}",
+                f"{row['earned_by_successes']:.2f}",
+                ", ".join(earned),
+            ]
+        )
     unsure = found["known"]["uncertainty"]
-    head = ["reward", "AUC: known, unseen", "Spearman with the rule-based reward",
-            "mean reward per frame of successes",
-            "mean reward per frame under random, zero, extreme actions"]  # fmt: skip
+    head = [
+        "reward",
+        "AUC: known, unseen",
+        "Spearman with the rule-based reward",
+        "mean reward per frame of successes",
+        "mean reward per frame under random, zero, extreme actions",
+    ]
     return f"""Done alone separates success from failure best, but gives no signal before it. With similarity
 to the goal frame the general reward follows progress best. The embedding reward does nearly as well, but
 needs recorded rewards.

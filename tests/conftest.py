@@ -99,11 +99,18 @@ def synthetic_episode(rng: np.random.Generator, fails: bool, length: int) -> lis
         held += success
         last = step == length - 1 or held > HOLD_FRAMES
         action = np.array((*move, 0, 0, 0, 0, -1), np.float32)
-        rows.append({
-            "gripper": state[:2].copy(), "object": before, "observation.state": state, "action": action,
-            "next.reward": float(success), "next.done": success, "next.success": success,
-            "next.truncated": last and not success,
-        })  # fmt: skip
+        rows.append(
+            {
+                "gripper": state[:2].copy(),
+                "object": before,
+                "observation.state": state,
+                "action": action,
+                "next.reward": float(success),
+                "next.done": success,
+                "next.success": success,
+                "next.truncated": last and not success,
+            }
+        )
         if last:
             break
     return rows
@@ -143,10 +150,15 @@ def synthetic_dataset(
         dataset.save_episode()
     dataset.finalize()
     vocabulary = {
-        "tasks": TASK_NAMES, "kinds": KINDS, "scenes": ["synthetic 0", "synthetic 1"],
-        "action_low": ACTION_LOW, "action_high": ACTION_HIGH, "hold_frames": HOLD_FRAMES,
-        "image_size": size, "cameras": cameras,
-    }  # fmt: skip
+        "tasks": TASK_NAMES,
+        "kinds": KINDS,
+        "scenes": ["synthetic 0", "synthetic 1"],
+        "action_low": ACTION_LOW,
+        "action_high": ACTION_HIGH,
+        "hold_frames": HOLD_FRAMES,
+        "image_size": size,
+        "cameras": cameras,
+    }
     (root / "meta" / "wmrl.json").write_text(json.dumps(vocabulary))
     return LeRobotDataset("local/synthetic", root=root)
 

@@ -109,8 +109,11 @@ def list_tree(files: Files, folder: str, recursive: bool) -> list[Json]:
         raise Refused(404, f"no folder {folder}", "EntryNotFound")
     folders = {path[: match.start()] for path in below for match in re.finditer("/", path)}
     entries = [describe_file(path, content) for path, content in below.items()]
-    entries += [{"type": "directory", "path": path, "oid": "0" * 40, "size": 0}
-                for path in sorted(folders) if path.startswith(prefix)]  # fmt: skip
+    entries += [
+        {"type": "directory", "path": path, "oid": "0" * 40, "size": 0}
+        for path in sorted(folders)
+        if path.startswith(prefix)
+    ]
     return [entry for entry in entries if recursive or "/" not in entry["path"].removeprefix(prefix)]
 
 
@@ -200,8 +203,11 @@ class Handler(BaseHTTPRequestHandler):
 
     def refs(self, kind: str, name: str) -> None:
         refs = self.repo(kind, name).refs
-        tags = [{"name": tag, "ref": f"refs/tags/{tag}", "targetCommit": sha}
-                for tag, sha in refs.items() if tag != BRANCH]  # fmt: skip
+        tags = [
+            {"name": tag, "ref": f"refs/tags/{tag}", "targetCommit": sha}
+            for tag, sha in refs.items()
+            if tag != BRANCH
+        ]
         branch = {"name": BRANCH, "ref": f"refs/heads/{BRANCH}", "targetCommit": refs[BRANCH]}
         self.answer_json({"branches": [branch], "tags": tags, "converts": []})
 

@@ -50,22 +50,31 @@ def test_todays_commands_take_the_flags_of_the_page(name: str) -> None:
         check(command)
 
 
-@pytest.mark.parametrize(("name", "said"), [
-    ("README.md", r"torch.Size\(\[16, 3, 32, 32\]\) tensor\(\["),
-    ("docs/world_models.md", r"(True|False) .* of 2.* of 4"),
-    ("docs/protocol.md", ""),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("README.md", r"torch.Size\(\[16, 3, 32, 32\]\) tensor\(\["),
+        ("docs/world_models.md", r"(True|False) .* of 2.* of 4"),
+        ("docs/protocol.md", ""),
+    ],
+)
 def test_the_python_of_a_page_runs(
-    name: str, said: str, trained_models: dict[str, Path], small_dataset: Any, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    name: str,
+    said: str,
+    trained_models: dict[str, Path],
+    small_dataset: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     for place, made in (
         ("outputs/demo/improve/world_model", trained_models["action_world_model"]),
         ("outputs/demo/text_world_model", trained_models["text_world_model"]),
         ("outputs/demo/improve/merged", small_dataset.root),
         ("outputs/world_model", trained_models["action_world_model"]),
-        ("data/demonstrations", small_dataset.root), ("data/rollouts", small_dataset.root),
-    ):  # fmt: skip
+        ("data/demonstrations", small_dataset.root),
+        ("data/rollouts", small_dataset.root),
+    ):
         (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / place).symlink_to(made)
     budget = tmp_path / "outputs" / "fair" / "budget.json"

@@ -41,17 +41,27 @@ def test_ppo_in_a_world_model_runs_without_a_simulator(
     """With the general reward, so that both world models imagine."""
     policy = save_untrained_policy(tmp_path / "policy", actions=7)
     flags = [
-        f"--policy.path={policy}", "--env.type=world_model", "--env.device=cpu", "--env.episode_length=4",
+        f"--policy.path={policy}",
+        "--env.type=world_model",
+        "--env.device=cpu",
+        "--env.episode_length=4",
         f"--env.world_model_path={trained_models['action_world_model']}",
         f"--env.text_world_model_path={trained_models['text_world_model']}",
-        f"--env.dataset.root={small_dataset.root}", "--algorithm.type=ppo", "--algorithm.value_iterations=0",
-        "--num_envs=2", "--iterations=2", "--gate.action=off", f"--output_dir={tmp_path / 'rl'}",
-    ]  # fmt: skip
+        f"--env.dataset.root={small_dataset.root}",
+        "--algorithm.type=ppo",
+        "--algorithm.value_iterations=0",
+        "--num_envs=2",
+        "--iterations=2",
+        "--gate.action=off",
+        f"--output_dir={tmp_path / 'rl'}",
+    ]
     folders = os.pathsep.join(str(ROOT / folder) for folder in ("", "policies", "datasets", "robots"))
     result = subprocess.run(
-        [sys.executable, "-c", TRAIN_WITHOUT_SIMULATOR, *flags], env={**os.environ, "PYTHONPATH": folders},
-        capture_output=True, text=True,
-    )  # fmt: skip
+        [sys.executable, "-c", TRAIN_WITHOUT_SIMULATOR, *flags],
+        env={**os.environ, "PYTHONPATH": folders},
+        capture_output=True,
+        text=True,
+    )
     assert result.returncode == 0, result.stderr[-3000:]
     assert [line["step"] for line in read_metrics(tmp_path / "rl")] == [1, 2]
 

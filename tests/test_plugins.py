@@ -71,8 +71,11 @@ def test_any_import_registers_every_type(statement: str, registered: dict[str, l
     """The package alone imports no simulator for it."""
     *found, simulators = registered[statement]
     expected = (
-        {"cnn", "openvla", "wm_mpc"}, set(REWARD_MODELS), {"world_model", "wmrl_maniskill"}, {"ppo", "grpo"},
-    )  # fmt: skip
+        {"cnn", "openvla", "wm_mpc"},
+        set(REWARD_MODELS),
+        {"world_model", "wmrl_maniskill"},
+        {"ppo", "grpo"},
+    )
     for names, wanted in zip(found, expected, strict=True):
         assert wanted <= {*names}
     assert statement != "import lerobot_wmrl" or not simulators

@@ -12,13 +12,25 @@ PATIENCE_S = 700
 
 def torchrun(script: Path, *arguments: str) -> None:
     """Two processes, which meet on this machine's loopback, whatever its name resolves to."""
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--local-addr=127.0.0.1",
-               "--nproc_per_node=2", str(script), *arguments]  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--local-addr=127.0.0.1",
+        "--nproc_per_node=2",
+        str(script),
+        *arguments,
+    ]
     folders = [str(ROOT / folder) for folder in ("", "policies", "datasets", "robots")]
     paths = os.pathsep.join([*folders, os.environ.get("PYTHONPATH", "")])
     own = {"PYTHONPATH": paths, "GLOO_SOCKET_IFNAME": "lo"}
     result = subprocess.run(
-        command, env={**os.environ, **own}, capture_output=True, text=True, cwd=ROOT,
+        command,
+        env={**os.environ, **own},
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
         timeout=PATIENCE_S,
-    )  # fmt: skip
+    )
     assert result.returncode == 0, result.stderr[-3000:]

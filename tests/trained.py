@@ -78,7 +78,11 @@ def told_apart(root: Path, folder: Path) -> Path:
 def text_config(tokenizer: Path, **settings: Any) -> TextWorldModelConfig:
     """A small autoregressive text world model; settings of its dynamics stand beside the others."""
     options = {
-        **SIZES, "clip_length": CLIP_LENGTH, "goal_horizon": 6, "dynamics": "autoregressive",
-        "conditioning": "cross_attention", **settings,
-    }  # fmt: skip
+        **SIZES,
+        "clip_length": CLIP_LENGTH,
+        "goal_horizon": 6,
+        "dynamics": "autoregressive",
+        "conditioning": "cross_attention",
+        **settings,
+    }
     return TextWorldModelConfig(tokenizer_path=str(tokenizer), device="cpu", **nested(options))

@@ -145,9 +145,11 @@ class RecordConfig(RunConfig):
             require_at_least(self, 1, "max_frames")
             if isinstance(self.env, WmrlManiSkillEnv | WorldModelEnv):
                 raise FieldError(
-                    "max_frames", self.max_frames, f"{self.env.type} has a setting of its own",
+                    "max_frames",
+                    self.max_frames,
+                    f"{self.env.type} has a setting of its own",
                     "set `env.episode_length`",
-                )  # fmt: skip
+                )
         if self.seed < 0 or (self.policy is None and self.seed + self.num_episodes > EVALUATION_SEED):
             raise FieldError(
                 "seed",
@@ -186,19 +188,25 @@ class RecordConfig(RunConfig):
         for name in ("depth", "tasks"):
             if getattr(self, name):
                 raise FieldError(
-                    name, getattr(self, name), "can be chosen in ManiSkill alone",
+                    name,
+                    getattr(self, name),
+                    "can be chosen in ManiSkill alone",
                     "leave it out (in a world model, `env.dataset.tasks` chooses among the starts)",
-                )  # fmt: skip
+                )
         if isinstance(self.env, WorldModelEnv) and self.env.dataset.branches:
             raise FieldError(
-                "env.dataset.branches", self.env.dataset.branches,
-                "recorded episodes begin with first frames", "leave it out",
-            )  # fmt: skip
+                "env.dataset.branches",
+                self.env.dataset.branches,
+                "recorded episodes begin with first frames",
+                "leave it out",
+            )
         if isinstance(self.env, WorldModelEnv) and not self.elsewhere and not self.env.dataset.given:
             raise FieldError(
-                "env.dataset.root", "", "the episodes that imagined ones begin in are recorded with them",
+                "env.dataset.root",
+                "",
+                "the episodes that imagined ones begin in are recorded with them",
                 "give a dataset in place of `env.dataset.frames` and `env.dataset.resets`",
-            )  # fmt: skip
+            )
         if self.like.given and not self.elsewhere:
             self._refuse_like("give `video` as a recording to merge it with has it, and leave this out")
         if self.elsewhere and self.shard_of[1] > 1:
@@ -324,16 +332,18 @@ class RecordConfig(RunConfig):
         if self.policy.pretrained_path:
             path = resolved_name(str(self.policy.pretrained_path))
             return {
-                "policy": path, "policy_settings": self.given["policy"].settings,
+                "policy": path,
+                "policy_settings": self.given["policy"].settings,
                 "policy_content": checkpoint_digest(path),
-            }  # fmt: skip
+            }
         names = {each.name for each in fields(self.policy)} - {each.name for each in fields(PreTrainedConfig)}
         settings = draccus.encode(self.policy)
         parts = {name: checkpoint_digest(settings[name]) for name in PARTS if settings.get(name)}
         return {
-            "policy": self.policy.type, **{f"policy.{name}": settings[name] for name in sorted(names)},
+            "policy": self.policy.type,
+            **{f"policy.{name}": settings[name] for name in sorted(names)},
             "policy_content": parts,
-        }  # fmt: skip
+        }
 
     def _simulated_content(self) -> dict[str, Any]:
         env = self.maniskill

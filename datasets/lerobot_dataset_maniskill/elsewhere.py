@@ -55,10 +55,16 @@ class Rollouts:
             like = config.like.open().meta if config.like.given else None
         assert config.policy is not None
         recorder = RolloutRecorder(
-            config.env, config.policy, None, config.exploration, like,
+            config.env,
+            config.policy,
+            None,
+            config.exploration,
+            like,
             num_envs=min(config.part_episodes, total) if isinstance(config.env, WorldModelEnv) else 1,
-            video=config.video, like_columns=config.like_columns, max_frames=config.max_frames,
-        )  # fmt: skip
+            video=config.video,
+            like_columns=config.like_columns,
+            max_frames=config.max_frames,
+        )
         won: list[bool] = []
         done = total - sum(self.parts[name] for name in missing)
         with closing(recorder), tqdm(total=total, initial=done, desc="record", unit="episode") as bar:

@@ -43,9 +43,11 @@ class ImaginedPartRecorder:
         path, remedy = config.imagination.world_model_path, "train it on what lerobot-wmrl-record recorded"
         if shown.get(OBS_STATE) != (len(STATE_NAMES),):
             raise FieldError(
-                "env.world_model_path", path,
-                f"does not imagine the recorder's state ({len(STATE_NAMES)} values)", remedy,
-            )  # fmt: skip
+                "env.world_model_path",
+                path,
+                f"does not imagine the recorder's state ({len(STATE_NAMES)} values)",
+                remedy,
+            )
         self.cameras = self.env.model.config.tokenizer.cameras
         self.side = maniskill_side(self.env.model.config.tokenizer, "env.world_model_path", path, remedy)
         fit_to_environment(config.policy, shown, len(ACTION_NAMES))
@@ -107,11 +109,14 @@ class ImaginedPartRecorder:
         state = observation[OBS_STATE].cpu().numpy()
         return [
             Frame(
-                {camera: frames[index] for camera, frames in images.items()}, {}, state[index],
-                float(reward[index]), False,
+                {camera: frames[index] for camera, frames in images.items()},
+                {},
+                state[index],
+                float(reward[index]),
+                False,
             )
             for index in range(len(state))
-        ]  # fmt: skip
+        ]
 
 
 def with_success(rows: list[Row], done_frames: int) -> list[Row]:

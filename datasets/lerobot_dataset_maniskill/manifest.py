@@ -105,8 +105,10 @@ def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
     if len(plans) > len(starts) and not config.exploration:
         logging.warning(
             "%d episodes begin from %d starts: without --exploration a policy whose actions are not random "
-            "repeats itself in them", config.num_episodes, len(starts),
-        )  # fmt: skip
+            "repeats itself in them",
+            config.num_episodes,
+            len(starts),
+        )
     return plans
 
 

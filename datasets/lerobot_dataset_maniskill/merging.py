@@ -24,9 +24,13 @@ WHOLE: Final = [0, 1]
 def merge_folders(folders: Sequence[Path], target: Path, repo_id: str) -> None:
     """Put all episodes of `folders`, in order, into a dataset at `target`, which must not exist."""
     aggregate_datasets(
-        repo_ids=[repo_id] * len(folders), aggr_repo_id=repo_id, roots=list(folders), aggr_root=target,
-        concatenate_videos=False, concatenate_data=False,  # appending rewrites the whole file for every part
-    )  # fmt: skip
+        repo_ids=[repo_id] * len(folders),
+        aggr_repo_id=repo_id,
+        roots=list(folders),
+        aggr_root=target,
+        concatenate_videos=False,
+        concatenate_data=False,  # appending rewrites the whole file for every part
+    )
 
 
 def describe(merged: Path, output_dir: Path, repo_id: str, content: Mapping[str, Any]) -> str:
@@ -138,8 +142,11 @@ def check_set(shards: Sequence[Path], contents: Sequence[Mapping[str, Any]]) -> 
     twice = sorted({number for number in numbers if numbers.count(number) > 1})
     missing = sorted(set(range(count)) - set(numbers))
     if twice or missing:
-        named = [f"{what} {', '.join(f'{number}/{count}' for number in which)}"
-                 for what, which in (("twice:", twice), ("missing:", missing)) if which]  # fmt: skip
+        named = [
+            f"{what} {', '.join(f'{number}/{count}' for number in which)}"
+            for what, which in (("twice:", twice), ("missing:", missing))
+            if which
+        ]
         raise FieldError("merge_shards", _listed(shards), "; ".join(named), "give each shard once")
 
 

@@ -35,9 +35,12 @@ def publish(api: HfApi, root: Path, repo_id: str, private: bool) -> None:
     with publishing(repo_id, ONLY_PUBLISHES.format(root=root)):
         create_repo(api, repo_id, private, REPO_TYPE_DATASET)
         api.upload_folder(
-            repo_id=repo_id, repo_type=REPO_TYPE_DATASET, folder_path=root,
-            allow_patterns=PUBLISHED, delete_patterns=PUBLISHED,
-        )  # fmt: skip
+            repo_id=repo_id,
+            repo_type=REPO_TYPE_DATASET,
+            folder_path=root,
+            allow_patterns=PUBLISHED,
+            delete_patterns=PUBLISHED,
+        )
         tag_version(api, repo_id)
     print(f"published: {api.endpoint}/datasets/{repo_id}")
 

@@ -107,10 +107,11 @@ def check_budget(config: RecordConfig, ledger: Ledger) -> None:
     end = config.seed + config.num_episodes
     if end > EVALUATION_SEED and not (maniskill and config.seed >= GATE_SEED):
         raise FieldError(
-            "seed", config.seed,
+            "seed",
+            config.seed,
             f"under a budget, seeds from {EVALUATION_SEED} on are for evaluation; these reach {end - 1}",
             "choose a smaller one",
-        )  # fmt: skip
+        )
 
 
 def discard(work: Path, content: Mapping[str, Any]) -> None:
@@ -134,9 +135,11 @@ def claimed(root: Path, work: Path, content: Mapping[str, Any]) -> Iterator[None
         else:
             if not stored.is_file() and foreign_files(work, LOCK, RECORDING_FILE):
                 raise FieldError(
-                    "output_dir", root, f"{work} beside it, for what is unfinished, holds something else",
+                    "output_dir",
+                    root,
+                    f"{work} beside it, for what is unfinished, holds something else",
                     "move that away, or choose another folder",
-                )  # fmt: skip
+                )
             write_json(stored, dict(content))
         try:
             yield

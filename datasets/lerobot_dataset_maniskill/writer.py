@@ -81,15 +81,26 @@ def _camera_feature(kind: str, image_size: int, channels: int) -> dict[str, Any]
 
 
 def create_dataset(
-    root: Path, repo_id: str, cameras: Sequence[str], image_size: int, depth: bool = False,
+    root: Path,
+    repo_id: str,
+    cameras: Sequence[str],
+    image_size: int,
+    depth: bool = False,
     video: bool = True,
-) -> LeRobotDataset:  # fmt: skip
+) -> LeRobotDataset:
     """Create an empty dataset at `root`, which must not exist."""
     return LeRobotDataset.create(
-        repo_id, FPS, dataset_features(cameras, image_size, depth, video), root=root, robot_type="panda",
-        use_videos=video or depth, streaming_encoding=True, encoder_threads=1,
-        rgb_encoder=video_encoder(), depth_encoder=depth_encoder(),
-    )  # fmt: skip
+        repo_id,
+        FPS,
+        dataset_features(cameras, image_size, depth, video),
+        root=root,
+        robot_type="panda",
+        use_videos=video or depth,
+        streaming_encoding=True,
+        encoder_threads=1,
+        rgb_encoder=video_encoder(),
+        depth_encoder=depth_encoder(),
+    )
 
 
 @dataclass(frozen=True)

@@ -33,17 +33,20 @@ JOINTS = [f"joint{index}" for index in range(1, 8)]
 FEATURES = {
     **{f"observation.images.{camera}": IMAGE for camera in CAMERAS},
     "observation.state": {
-        "dtype": "float32", "shape": (18,),
+        "dtype": "float32",
+        "shape": (18,),
         "names": [*JOINTS, *(f"{joint}_velocity" for joint in JOINTS), "gripper", "x", "y", "z"],
     },
     "action": {
-        "dtype": "float32", "shape": (4,), "names": ["x", "y", "z", "gripper"],
+        "dtype": "float32",
+        "shape": (4,),
+        "names": ["x", "y", "z", "gripper"],
         "info": {"low": [-1.0, -1.0, -1.0, 0.0], "high": [1.0, 1.0, 1.0, 2.0]},
     },
     "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
     "next.success": {"dtype": "bool", "shape": (1,), "names": None},
     "next.done": {"dtype": "bool", "shape": (1,), "names": None},
-}  # fmt: skip
+}
 
 
 class Expert:
@@ -88,15 +91,17 @@ def record(root: Path, num_episodes: int, seed: int, noise: list[float]) -> None
             action = np.clip(action, low, high).astype(np.float32)
             after, reward, terminated, truncated, info = env.step(action)
             done = terminated or truncated
-            dataset.add_frame({
-                **{f"observation.images.{camera}": observation["pixels"][camera] for camera in CAMERAS},
-                "observation.state": observation["agent_pos"].astype(np.float32),
-                "action": action,
-                "next.reward": np.array([reward], np.float32),
-                "next.success": np.array([info["is_success"]]),
-                "next.done": np.array([done]),
-                "task": TASK,
-            })  # fmt: skip
+            dataset.add_frame(
+                {
+                    **{f"observation.images.{camera}": observation["pixels"][camera] for camera in CAMERAS},
+                    "observation.state": observation["agent_pos"].astype(np.float32),
+                    "action": action,
+                    "next.reward": np.array([reward], np.float32),
+                    "next.success": np.array([info["is_success"]]),
+                    "next.done": np.array([done]),
+                    "task": TASK,
+                }
+            )
             observation = after
         dataset.save_episode()
         successes += info["is_success"]

@@ -64,15 +64,17 @@ def record(
             after, reward, terminated, truncated, info = env.step(action)
             success = info["is_success"]
             done = terminated or truncated or step == steps - 1
-            dataset.add_frame({
-                "observation.image": observation["pixels"],
-                "observation.state": observation["agent_pos"].astype(np.float32),
-                "action": action,
-                "next.reward": np.array([reward], np.float32),
-                "next.success": np.array([success]),
-                "next.done": np.array([done]),
-                "task": env.task_description,
-            })  # fmt: skip
+            dataset.add_frame(
+                {
+                    "observation.image": observation["pixels"],
+                    "observation.state": observation["agent_pos"].astype(np.float32),
+                    "action": action,
+                    "next.reward": np.array([reward], np.float32),
+                    "next.success": np.array([success]),
+                    "next.done": np.array([done]),
+                    "task": env.task_description,
+                }
+            )
             observation = after
             if done:
                 break

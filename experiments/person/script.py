@@ -68,9 +68,12 @@ def drive_by_keys(world: World, episode: int, frames: int) -> tuple[list[list[fl
 def write_script(given: argparse.Namespace) -> None:
     """Drive until there are enough successes; write the actions, and the episodes in which they begin."""
     env = DrivenEnv(
-        world_model_path=given.world_model, episode_length=given.frames, done_threshold=given.done_threshold,
-        done_frames=given.done_frames, device="cpu",
-    )  # fmt: skip
+        world_model_path=given.world_model,
+        episode_length=given.frames,
+        done_threshold=given.done_threshold,
+        done_frames=given.done_frames,
+        device="cpu",
+    )
     policy = read_policy_config(given.policy, ["--device=cpu"])
     world = load_world(env, ChosenEpisodes(given.root), policy, None)
     assert world.table is not None

@@ -27,8 +27,11 @@ SETTINGS: Final = ("config.json", "adapter_config.json")
 """A checkpoint's files of settings."""
 
 PARTS: Final = (
-    "base_model_name_or_path", "world_model_path", "text_world_model_path", "proposal_path",
-)  # fmt: skip
+    "base_model_name_or_path",
+    "world_model_path",
+    "text_world_model_path",
+    "proposal_path",
+)
 """Settings of policies that name further checkpoints."""
 
 MODEL_FILES: Final = (*SETTINGS, "*processor.json", "*.safetensors")
@@ -256,6 +259,8 @@ def require_resumable(output_dir: Path) -> None:
     """Raise FieldError if `resume` is asked for and there is no checkpoint to go on from."""
     if newest_checkpoint(output_dir) is None:
         raise FieldError(
-            "resume", True, f"there is no checkpoint in {output_dir} to go on from",
+            "resume",
+            True,
+            f"there is no checkpoint in {output_dir} to go on from",
             "leave `resume` out to begin",
-        )  # fmt: skip
+        )

@@ -43,9 +43,11 @@ def require_new(field: str, target: Path) -> None:
         raise FieldError(field, target, "there is something already", "choose a new folder")
     if target.is_mount():
         raise FieldError(
-            field, target, "a disk is mounted there, and a whole folder cannot take its place",
+            field,
+            target,
+            "a disk is mounted there, and a whole folder cannot take its place",
             "choose a folder in it",
-        )  # fmt: skip
+        )
 
 
 def foreign_files(folder: Path, *allowed: str) -> bool:

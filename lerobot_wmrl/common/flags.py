@@ -40,6 +40,11 @@ def format_lerobot_flags(settings: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def program_call(program: str, settings: Mapping[str, Any]) -> list[str]:
+    """Return one of our commands with these settings."""
+    return [program, *format_flags(settings)]
+
+
 def flag_as_typed(name: str, value: Any) -> str:
     """Return a flag as one types it in a shell, whatever its value has in it: `'--dataset.root=my data'`."""
     return shlex.join(format_flags({name: value}))

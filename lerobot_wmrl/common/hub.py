@@ -69,9 +69,11 @@ def create_repo(api: HfApi, name: str, private: bool | None, kind: str | None = 
     name = api.create_repo(name, repo_type=kind, private=private or None, exist_ok=True).repo_id
     if private and not api.repo_info(name, repo_type=kind).private:
         raise FieldError(
-            "private", "true", f"{name} is public on the hub already",
+            "private",
+            "true",
+            f"{name} is public on the hub already",
             "make it private there, or choose another `repo_id`",
-        )  # fmt: skip
+        )
     return name
 
 

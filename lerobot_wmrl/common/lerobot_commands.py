@@ -1,8 +1,9 @@
 """LeRobot's own commands as stages, each of which can be called again after an interruption."""
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
@@ -11,13 +12,13 @@ from lerobot_wmrl.common.flags import Flags, format_lerobot_flags
 from lerobot_wmrl.common.hub import cached_repo
 
 
-def train_command(folder: Path, flags: Sequence[str]) -> list[str]:
-    """Return lerobot-train with these flags and this output folder, or, by other flags, on from a whole
+def train_command(folder: Path, settings: Mapping[str, Any]) -> list[str]:
+    """Return lerobot-train with these settings and this output folder, or, by other flags, on from a whole
     checkpoint there. It refuses a folder without one."""
     if whole := whole_checkpoint(folder):
         trained = whole / PRETRAINED_MODEL_DIR / "train_config.json"
         return ["lerobot-train", *format_lerobot_flags({"config_path": str(trained), "resume": True})]
-    return ["lerobot-train", *flags, *format_lerobot_flags({"output_dir": str(folder)})]
+    return ["lerobot-train", *format_lerobot_flags({**settings, "output_dir": str(folder)})]
 
 
 def whole_checkpoint(folder: Path) -> Path | None:
@@ -29,11 +30,15 @@ def whole_checkpoint(folder: Path) -> Path | None:
 
 def merge_command(folder: Path, datasets: Mapping[str, Path]) -> list[str]:
     """Return lerobot-edit-dataset that merges datasets, name → folder, into a new one."""
-    return edit_command(folder, "merge", {
-        "operation.repo_ids": [f"local/{name}" for name in datasets],
-        "operation.roots": [str(root) for root in datasets.values()],
-        "operation.concatenate_data": False,
-    })  # fmt: skip
+    return edit_command(
+        folder,
+        "merge",
+        {
+            "operation.repo_ids": [f"local/{name}" for name in datasets],
+            "operation.roots": [str(root) for root in datasets.values()],
+            "operation.concatenate_data": False,
+        },
+    )
 
 
 def edit_command(folder: Path, operation: str, flags: Flags) -> list[str]:

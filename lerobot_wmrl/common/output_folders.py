@@ -91,10 +91,11 @@ def require_same_content(output_dir: Path, stored: Mapping[str, str], given: Map
     """Raise FieldError where a name stands for something else than when the folder was begun."""
     if changed := [name for name in stored.keys() & given.keys() if stored[name] != given[name]]:
         raise FieldError(
-            "output_dir", output_dir,
+            "output_dir",
+            output_dir,
             f"was begun with another content of {', '.join(sorted(changed))}, under the same name",
             "choose another folder, or restore what was there to continue",
-        )  # fmt: skip
+        )
 
 
 def require_same(
@@ -103,9 +104,11 @@ def require_same(
     """Raise FieldError for settings that differ from those that the folder was begun with."""
     if differing := different_settings(stored, given, free):
         raise FieldError(
-            "output_dir", output_dir, f"was begun with other settings ({'; '.join(differing)})",
+            "output_dir",
+            output_dir,
+            f"was begun with other settings ({'; '.join(differing)})",
             "choose another folder, or repeat the first settings to continue",
-        )  # fmt: skip
+        )
 
 
 @contextmanager

@@ -42,9 +42,11 @@ class Pipeline:
 
 
 def make_pipeline(
-    config: PreTrainedConfig, preprocessor: Any, postprocessor: Any,
+    config: PreTrainedConfig,
+    preprocessor: Any,
+    postprocessor: Any,
     shown: Callable[[Observation], Observation] = unchanged,
-) -> Pipeline:  # fmt: skip
+) -> Pipeline:
     """Wrap a policy's processors. Observations that the policy has no input for are left out. Actions stay on
     the policy's device, where LeRobot's postprocessors would move them to the CPU."""
     known = {*(config.input_features or {}), INSTRUCTIONS, ACTION, ACTION_IS_PAD}

@@ -39,28 +39,36 @@ def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
     folder, revision = settled_folder(path), given_revision(overrides)
     if revision and folder.exists():
         raise FieldError(
-            "policy.pretrained_revision", revision, f"{path} is a folder, and these have no revisions",
+            "policy.pretrained_revision",
+            revision,
+            f"{path} is a folder, and these have no revisions",
             "leave it out, or give the name of a policy on the hub",
-        )  # fmt: skip
+        )
     if not (folder / "config.json").is_file() and (folder.exists() or not may_be_on_hub(path)):
         raise FieldError(
-            "policy.path", path, "no checkpoint there (config.json is missing)",
+            "policy.path",
+            path,
+            "no checkpoint there (config.json is missing)",
             "give the output folder of a policy's training, or a hub id",
-        )  # fmt: skip
+        )
     try:
         if revision:
             folder = local_model_folder(path, revision=revision)
         config = PreTrainedConfig.from_pretrained(str(folder), cli_overrides=overrides)
     except SystemExit as error:  # of argparse, which has named them
         raise FieldError(
-            "policy.path", path, "its policy has not all of the settings that are given beside it",
+            "policy.path",
+            path,
+            "its policy has not all of the settings that are given beside it",
             "leave out those that the message above names",
-        ) from error  # fmt: skip
+        ) from error
     except Exception as error:  # draccus, the hub and json each raise their own
         raise FieldError(
-            "policy.path", path, f"no policy can be loaded from it ({first_line(error)})",
+            "policy.path",
+            path,
+            f"no policy can be loaded from it ({first_line(error)})",
             "give the output folder of a policy's training, or a hub id",
-        ) from error  # fmt: skip
+        ) from error
     config.pretrained_path, config.pretrained_revision = folder, None
     return config
 
@@ -243,10 +251,11 @@ def load_trained_weights(policy: Any, weights: dict[str, Any]) -> None:
 def unreadable_policy(config: PreTrainedConfig, error: Exception) -> FieldError:
     """Return the error for a checkpoint whose weights cannot be loaded."""
     return FieldError(
-        "policy.path", config.pretrained_path,
+        "policy.path",
+        config.pretrained_path,
         f"{weights_file(config)} cannot be read ({first_line(error)})",
         "it is missing, truncated or of another version: use an earlier checkpoint or train again",
-    )  # fmt: skip
+    )
 
 
 def frozen_copy(policy: Any) -> Any:

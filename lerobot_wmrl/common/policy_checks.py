@@ -40,25 +40,31 @@ def require_distillable(config: PreTrainedConfig) -> None:
     rewards, or whose actions are relative to a state that later actions of a chunk no longer have."""
     if getattr(config, "use_relative_actions", False):
         raise FieldError(
-            "policy.path", config.pretrained_path, f"this {config.type} predicts relative actions",
+            "policy.path",
+            config.pretrained_path,
+            f"this {config.type} predicts relative actions",
             "take one that was trained with `use_relative_actions=false`",
-        )  # fmt: skip
+        )
     ahead = max(config.observation_delta_indices or [0]) > 0
     if ahead or config.reward_delta_indices is not None:
         raise FieldError(
-            "policy.path", config.pretrained_path,
+            "policy.path",
+            config.pretrained_path,
             f"{config.type} learns from {'later observations' if ahead else 'rewards'}, and a planner's "
-            "labels have none", "take one that is cloned from observations and actions, such as act",
-        )  # fmt: skip
+            "labels have none",
+            "take one that is cloned from observations and actions, such as act",
+        )
 
 
 def require_chunks(config: PreTrainedConfig) -> None:
     """Raise FieldError for an ACT policy whose actions are averages of several chunks."""
     if config.temporal_ensemble_coeff is not None:
         raise FieldError(
-            "policy.temporal_ensemble_coeff", config.temporal_ensemble_coeff,
-            "averaged chunks have no log-probability", "set `policy.temporal_ensemble_coeff` to null",
-        )  # fmt: skip
+            "policy.temporal_ensemble_coeff",
+            config.temporal_ensemble_coeff,
+            "averaged chunks have no log-probability",
+            "set `policy.temporal_ensemble_coeff` to null",
+        )
 
 
 def fit_to_environment(
@@ -82,9 +88,11 @@ def seen_shape(feature: PolicyFeature) -> tuple[int, ...]:
 
 
 def check_fit(
-    config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]], action_size: int,
+    config: PreTrainedConfig,
+    shown: Mapping[str, tuple[int, ...]],
+    action_size: int,
     where: str = "the environment",
-) -> None:  # fmt: skip
+) -> None:
     """Raise FieldError unless an environment shows what the policy looks at, in the same sizes.
 
     Args:
@@ -98,41 +106,59 @@ def check_fit(
     for name, feature in (config.input_features or {}).items():
         if name not in shown and name != OBS_STATE and not name.startswith(OBS_IMAGE):
             raise FieldError(
-                "policy.path", path,
+                "policy.path",
+                path,
                 f"the policy needs {name}, and a policy is shown cameras and {OBS_STATE} alone",
                 "train it on data without that column (lerobot-edit-dataset, remove_feature)",
-            )  # fmt: skip
+            )
         if name not in shown:
             raise FieldError(
-                "policy.path", path,
+                "policy.path",
+                path,
                 f"the policy needs {name}, which {where} does not have (its cameras: {cameras})",
                 "use one with the policy's cameras and state, or train the policy on what this one shows",
-            )  # fmt: skip
+            )
         if shown[name] != seen_shape(feature):
             needed = f"the policy needs {name} of shape {seen_shape(feature)}"
             of_images = "use the image size that the policy was trained on"
             of_state = "use the robot that the policy was trained for, or train it on this one's data"
             raise FieldError(
-                "policy.path", path, f"{needed}, {where} has {shown[name]}",
+                "policy.path",
+                path,
+                f"{needed}, {where} has {shown[name]}",
                 of_images if name.startswith(OBS_IMAGE) else of_state,
-            )  # fmt: skip
+            )
+    check_action_size(config, action_size, where)
+
+
+def check_action_size(config: PreTrainedConfig, action_size: int, where: str) -> None:
+    """Raise FieldError unless the policy's actions have as many components as an environment's."""
+    path = config.pretrained_path
     if config.action_feature is None:
         raise FieldError(
-            "policy.path", path, "does not say how many components an action has",
+            "policy.path",
+            path,
+            "does not say how many components an action has",
             "train it on a dataset with the environment's actions",
-        )  # fmt: skip
+        )
     wanted = config.action_feature.shape[0]
     if wanted != action_size:
         raise FieldError(
-            "policy.path", path, f"the policy has {wanted} action components, {where} {action_size}",
+            "policy.path",
+            path,
+            f"the policy has {wanted} action components, {where} {action_size}",
             "train it on a dataset with these actions",
-        )  # fmt: skip
+        )
 
 
 def check_units(
-    config: PreTrainedConfig, postprocessor: Any, names: Sequence[str], low: Tensor, high: Tensor,
+    config: PreTrainedConfig,
+    postprocessor: Any,
+    names: Sequence[str],
+    low: Tensor,
+    high: Tensor,
     where: str = "the environment",
-) -> None:  # fmt: skip
+) -> None:
     """Raise FieldError if a policy's actions are in other units than an environment's.
 
     This is seen from the actions that the policy was trained on: no component's mean may lie farther outside
@@ -151,11 +177,12 @@ def check_units(
         strange = (mean < least - width) | (mean > most + width)
         for component in strange.nonzero().flatten().tolist()[:1]:
             raise FieldError(
-                "policy.path", config.pretrained_path,
+                "policy.path",
+                config.pretrained_path,
                 f"was trained on actions whose {names[component]} is {mean[component]:.4g} on average, in "
                 f"{where} it is between {least[component]:.4g} and {most[component]:.4g}",
                 "use a policy with the same actions in the same units",
-            )  # fmt: skip
+            )
     for (std,) in _action_statistics(postprocessor, "std"):
         spread, least, most = (torch.as_tensor(each).flatten().cpu().double() for each in (std, low, high))
         check_spread(config, spread, names, least, most, where)
@@ -171,12 +198,13 @@ def check_spread(
     if 2 * strange.sum() > moving.sum():
         component = int(strange.nonzero()[0])
         raise FieldError(
-            "policy.path", config.pretrained_path,
+            "policy.path",
+            config.pretrained_path,
             f"was trained on actions whose {names[component]} has a standard deviation of "
             f"{std[component]:.4g}, in {where} it is between {least[component]:.4g} and "
             f"{most[component]:.4g}, and others are like it",
             "use a policy with the same actions in the same units: displacements are no targets",
-        )  # fmt: skip
+        )
 
 
 def learnt_range(postprocessor: Any) -> tuple[Tensor, Tensor] | None:

@@ -48,9 +48,11 @@ def require_exact_updates(trained: Iterable[Tensor]) -> None:
     """Raise FieldError if trained weights are in bfloat16, whose eight bits round small steps away."""
     if any(weights.dtype == torch.bfloat16 for weights in trained):
         raise FieldError(
-            "policy.dtype", "bfloat16", "such weights cannot be trained: most steps would be rounded away",
+            "policy.dtype",
+            "bfloat16",
+            "such weights cannot be trained: most steps would be rounded away",
             "use `policy.dtype=float32`, or train adapters, `peft.method_type=LORA`",
-        )  # fmt: skip
+        )
 
 
 def compute_in(dtype: torch.dtype, device: torch.device | str) -> torch.autocast:

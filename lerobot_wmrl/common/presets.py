@@ -46,11 +46,6 @@ def without_other_types(settings: Mapping[str, Any], types: Mapping[str, str]) -
     return {name: value for name, value in settings.items() if not name.startswith(replaced)}
 
 
-def preset_flags(preset: str, command: str, types: Sequence[str] = ()) -> list[str]:
-    """Return the flags of a preset for a command. Raises ValueError if it has none."""
-    return format_flags(preset_settings(preset, command, types))
-
-
 def preset_settings(preset: str, command: str, types: Sequence[str] = ()) -> dict[str, Any]:
     """Read a preset of a command.
 

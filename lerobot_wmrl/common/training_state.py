@@ -32,9 +32,13 @@ def gather_random_states() -> list[dict[str, Any]]:
 
 
 def save_checkpoint(
-    output_dir: Path, total: int, step: int, write_models: Callable[[Path], None], optimizer: Optimizer,
+    output_dir: Path,
+    total: int,
+    step: int,
+    write_models: Callable[[Path], None],
+    optimizer: Optimizer,
     scheduler: LRScheduler | None = None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Write a whole checkpoint or none, from the first process, and return its folder. All must call it.
 
     Args:
@@ -105,10 +109,11 @@ def load_training_state(checkpoint: Path, optimizer: Optimizer, scheduler: LRSch
     (rank, size), began_with = rank_and_size(), len(state["random_states"])
     if began_with != size:
         raise FieldError(
-            "output_dir", checkpoint.parent.parent,
+            "output_dir",
+            checkpoint.parent.parent,
             f"this run began with {began_with} processes, here are {size}",
             f"continue it with torchrun --nproc_per_node={began_with}",
-        )  # fmt: skip
+        )
     optimizer.load_state_dict(state["optimizer"])
     if scheduler is not None:
         scheduler.load_state_dict(state["scheduler"])

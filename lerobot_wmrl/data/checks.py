@@ -51,9 +51,11 @@ def check_cameras(meta: Any, camera_keys: Sequence[str], field: str | None = Non
                     "dataset.root", meta.root, f"{problem}, which the model looks at", "use one that has it"
                 )
             raise FieldError(
-                field, camera_names(camera_keys), problem,
+                field,
+                camera_names(camera_keys),
+                problem,
                 f"set `{field}` to match, or use a dataset with this camera",
-            )  # fmt: skip
+            )
 
 
 def camera_names(camera_keys: Sequence[str]) -> list[str]:
@@ -71,20 +73,23 @@ def check_depth(features: Mapping[str, Any], camera_keys: Sequence[str]) -> None
     for key in map(depth_key, camera_keys):
         if key not in features:
             raise FieldError(
-                "depth", True, f"the world model looks at {key}, which the dataset lacks",
+                "depth",
+                True,
+                f"the world model looks at {key}, which the dataset lacks",
                 "record it with lerobot-wmrl-record --depth=true",
-            )  # fmt: skip
+            )
 
 
 def require_shown(table: EpisodeTable, episodes: Iterable[int]) -> None:
     """Raise FieldError if episodes succeed and none of their frames shows it."""
     if not table.shows_success(episodes):
         raise FieldError(
-            "dataset.root", table.dataset.root,
+            "dataset.root",
+            table.dataset.root,
             f"{success_column(table.dataset.features)} is true in the last rows of episodes alone, and the "
             "frame after the last action is not recorded: no frame shows success",
             "label it anew: lerobot-wmrl-label with --success.type=ends takes the last frames for solved",
-        )  # fmt: skip
+        )
 
 
 def check_widths(meta: Any, wanted: Mapping[str, int]) -> None:
@@ -94,11 +99,12 @@ def check_widths(meta: Any, wanted: Mapping[str, int]) -> None:
         size = meta.features[name]["shape"][0] if name in meta.features else 0
         if width and size != width:
             raise FieldError(
-                "dataset.root", meta.root,
+                "dataset.root",
+                meta.root,
                 f"{name}: the world model was trained with {width} components, the dataset has "
                 f"{size or 'none'}",
                 "use a dataset like the one it was trained on",
-            )  # fmt: skip
+            )
 
 
 def check_statistics(meta: Any, key: str) -> None:
@@ -108,11 +114,12 @@ def check_statistics(meta: Any, key: str) -> None:
         values = np.asarray((meta.stats or {}).get(key, {}).get(name, ()), np.float64).reshape(-1)
         if len(values) != size or not np.isfinite(values).all():
             raise FieldError(
-                "dataset.root", meta.root,
+                "dataset.root",
+                meta.root,
                 f"its statistics (meta/stats.json) say that the {name} of {key} is {values.tolist()}, where "
                 f"{size} finite numbers should be",
                 f"compute them again: {edit_advice(meta.root, 'recompute_stats', {})}",
-            )  # fmt: skip
+            )
 
 
 def solved_from_the_start(table: EpisodeTable) -> str | None:
@@ -132,6 +139,8 @@ def check_episode_lengths(root: Path, episodes: int, frames: int) -> None:
     predict."""
     if frames <= episodes:
         raise FieldError(
-            "dataset.root", root, f"{episodes} episodes to learn from, of {frames} frames in all",
+            "dataset.root",
+            root,
+            f"{episodes} episodes to learn from, of {frames} frames in all",
             "a world model learns from episodes of two frames or more: record longer ones, or choose others",
-        )  # fmt: skip
+        )

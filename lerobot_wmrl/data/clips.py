@@ -246,9 +246,13 @@ def window_actions(
 
 
 def clip_from_windows(
-    tokens: Tensor, batch: Mapping[str, Any], camera_key: str, state_size: int, depth: Tensor | None = None,
+    tokens: Tensor,
+    batch: Mapping[str, Any],
+    camera_key: str,
+    state_size: int,
+    depth: Tensor | None = None,
     features: Tensor | None = None,
-) -> Clip:  # fmt: skip
+) -> Clip:
     """Make clips of windows as lerobot-train gives them.
 
     A window ends at its row of the dataset. LeRobot fills a window that would begin before its episode with
@@ -271,26 +275,41 @@ def clip_from_windows(
     """
     (rows, length), device = tokens.shape[:2], tokens.device
     action, begins = window_actions(batch, rows, length, device)
-    state = action.new_zeros(rows, length, 0)
-    if state_size:
-        state = batch[OBS_STATE].reshape(rows, length, -1)
-    for name, values in ((ACTION, action), (OBS_STATE, state)):
-        if not torch.isfinite(values).all():
-            raise ValueError(f"{name}: holds NaN or infinity; remove the episodes that do from the dataset")
+    state = batch[OBS_STATE].reshape(rows, length, -1) if state_size else action.new_zeros(rows, length, 0)
+    require_finite(action, state)
     padded = batch.get(f"{camera_key}_is_pad", torch.zeros(rows, length, dtype=torch.bool)).to(device)
     before, index = padded.sum(1, keepdim=True), unpadded_rows(padded)
     begins = begins | (before > 0)
-    valid = torch.arange(length, device=device) < length - before
-    last = torch.arange(length, device=device) == length - 1 - before
-    done, known = torch.zeros(rows, length, device=device), torch.zeros_like(last)
-    if isinstance(batch.get(DONE), Tensor):  # LeRobot's processors put False where the dataset has none
-        done, known = last * batch[DONE].reshape(rows, 1).float(), last & begins
+    steps = torch.arange(length, device=device)
+    done, known = window_labels(batch, steps == length - 1 - before, begins)
     tokens, state, action = (take_steps(values, index) for values in (tokens, state, action))
     depth, features = (each if each is None else take_steps(each, index) for each in (depth, features))
     return Clip(
-        tokens=tokens, state=state, action=action, done=done, valid=valid, done_known=known,
-        instructions=list(batch.get("task", [""] * rows)), depth=depth, features=features,
-    )  # fmt: skip
+        tokens=tokens,
+        state=state,
+        action=action,
+        done=done,
+        valid=steps < length - before,
+        done_known=known,
+        instructions=list(batch.get("task", [""] * rows)),
+        depth=depth,
+        features=features,
+    )
+
+
+def window_labels(batch: Mapping[str, Any], last: Tensor, begins: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a window's labels of success, and where they count: at the last row of those that contain their
+    episode's start. last: (B, T); begins: (B, T) or (B, 1)."""
+    if not isinstance(batch.get(DONE), Tensor):  # LeRobot's processors put False where the dataset has none
+        return torch.zeros_like(last, dtype=torch.float), torch.zeros_like(last)
+    return last * batch[DONE].reshape(len(last), 1).float(), last & begins
+
+
+def require_finite(action: Tensor, state: Tensor) -> None:
+    """Raise ValueError if a clip's actions or states hold NaN or infinity."""
+    for name, values in ((ACTION, action), (OBS_STATE, state)):
+        if not torch.isfinite(values).all():
+            raise ValueError(f"{name}: holds NaN or infinity; remove the episodes that do from the dataset")
 
 
 def unpadded_rows(padded: Tensor) -> Tensor:

@@ -142,10 +142,11 @@ def open_dataset(
         )
     if unfinished(root):
         raise FieldError(
-            "dataset.root", root,
+            "dataset.root",
+            root,
             f"its recording was not finished: it has no table of episodes ({EPISODES_DIR})",
             "record it again: LeRobot writes the table when a recording ends",
-        )  # fmt: skip
+        )
     name = repo_id or Path(root).absolute().name
     try:
         lacking = missing_files(Path(root))
@@ -167,9 +168,11 @@ def open_dataset(
         ) from error
     if missing:
         raise FieldError(
-            "dataset.root", root, f"{len(missing)} files are missing, the first is {missing[0]}",
+            "dataset.root",
+            root,
+            f"{len(missing)} files are missing, the first is {missing[0]}",
             "copy or download the dataset again, and only if there is no other copy, record it again",
-        )  # fmt: skip
+        )
     return with_whole_rate(dataset, "dataset.root", root)
 
 
@@ -186,9 +189,11 @@ def save_episode(dataset: LeRobotDataset) -> None:
 
 
 def download_dataset(
-    repo_id: str, revision: str | None = None, root: str | None = None,
+    repo_id: str,
+    revision: str | None = None,
+    root: str | None = None,
     episodes: Collection[int] | None = None,
-) -> LeRobotDataset:  # fmt: skip
+) -> LeRobotDataset:
     """Download a dataset of the hub, to `root` or LeRobot's cache, and open it. FieldError if that fails.
 
     Args:
@@ -203,10 +208,12 @@ def download_dataset(
             copy = Path("data") / repo_id.rpartition("/")[2]
             raise older_format("dataset.repo_id", repo_id, repo_id, copy) from error
         raise FieldError(
-            "dataset.repo_id", repo_id, f"cannot be downloaded ({first_line(error)})",
+            "dataset.repo_id",
+            repo_id,
+            f"cannot be downloaded ({first_line(error)})",
             "correct the name, log in with `hf auth login` if it is private, or give a folder on disk, "
             "`dataset.root`",
-        ) from error  # fmt: skip
+        ) from error
     return with_whole_rate(dataset, "dataset.repo_id", repo_id)
 
 
@@ -230,9 +237,12 @@ def open_rows(repo_id: str, episodes: Collection[int] | None, **where: Any) -> L
     dataset = open_videos_of(episodes=list(episodes))
     if missing_files(dataset.root, episodes):
         snapshot_download(
-            repo_id, repo_type="dataset", revision=dataset.revision, allow_patterns="data/*",
+            repo_id,
+            repo_type="dataset",
+            revision=dataset.revision,
+            allow_patterns="data/*",
             **({"local_dir": dataset.root} if where.get("root") else {"cache_dir": HF_LEROBOT_HUB_CACHE}),
-        )  # fmt: skip
+        )
     dataset.episodes = dataset.reader.episodes = None
     dataset.reader.load_and_activate()
     return dataset
@@ -249,11 +259,13 @@ def older_format(field: str, value: object, repo_id: str, root: str | Path) -> F
     what is there, or what it downloads."""
     script = "python -m lerobot.scripts.convert_dataset_v21_to_v30"
     return FieldError(
-        field, value, "is in a format before LeRobotDataset v3.0",
+        field,
+        value,
+        "is in a format before LeRobotDataset v3.0",
         "convert it (LeRobot converts v2.1; what is older, first by an earlier LeRobot to v2.1): "
         f"`{script} --repo-id={repo_id} {flag_as_typed('root', root)} --push-to-hub=false`, "
         f"and give `dataset.root` {root}. The old files are kept beside it",
-    )  # fmt: skip
+    )
 
 
 def fingerprint(root: Path, meta: bool = True) -> str:

@@ -55,9 +55,13 @@ def decode_video(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -
     path = Path(dataset.root) / dataset.meta.get_video_file_path(episode, key)
     try:
         return decode_video_frames(
-            path, times, dataset.tolerance_s, VIDEO_BACKEND, return_uint8=True,
+            path,
+            times,
+            dataset.tolerance_s,
+            VIDEO_BACKEND,
+            return_uint8=True,
             is_depth=key in dataset.meta.depth_keys,
-        )  # fmt: skip
+        )
     except Exception as error:
         raise ValueError(
             f"dataset {dataset.root}: episode {episode}: {key}: {path.name} cannot be decoded ({error}). If "
@@ -73,9 +77,13 @@ def decode_depth(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -
         codes = decode_video(dataset, episode, key, rows)
         encoder = DepthEncoderConfig.from_video_info(info)
         metres = dequantize_depth(
-            codes, encoder.depth_min, encoder.depth_max, encoder.shift, encoder.use_log,
+            codes,
+            encoder.depth_min,
+            encoder.depth_max,
+            encoder.shift,
+            encoder.use_log,
             output_unit=DEPTH_METER_UNIT,
-        )  # fmt: skip
+        )
         return torch.where(codes.int() > 0, torch.as_tensor(metres), 0.0)
     maps = np.stack([np.asarray(image) for image in stored_images(dataset, key, rows)])
     unit = info.get("depth_unit") or infer_depth_unit(maps.dtype)

@@ -91,19 +91,24 @@ def read_embodiment(meta: Any, given: Embodiment) -> Embodiment:
     low, high, source = given.action_low, given.action_high, "settings"
     if bool(low) != bool(high):
         raise FieldError(
-            "embodiment.action_low", low, f"is given without the other end (action_high={high})",
+            "embodiment.action_low",
+            low,
+            f"is given without the other end (action_high={high})",
             "give both, or neither",
-        )  # fmt: skip
+        )
     if not low and recorded is not None:
         (low, high), source = recorded, "dataset"
     if not low:
         (low, high), source = observed_range(meta), "recorded actions"
     check_range(low, high, names, "action.info.{}" if source == "dataset" else "embodiment.action_{}")
     embodiment = replace(
-        given, fps=whole_rate(meta.fps, "dataset.root", meta.root),
-        action_names=names, action_low=list(low), action_high=list(high),
+        given,
+        fps=whole_rate(meta.fps, "dataset.root", meta.root),
+        action_names=names,
+        action_low=list(low),
+        action_high=list(high),
         state_names=component_names(meta.features[OBS_STATE]) if OBS_STATE in meta.features else [],
-    )  # fmt: skip
+    )
     logging.info("range of the actions, from the %s: %s", source, embodiment.range_text())
     return embodiment
 
@@ -115,9 +120,11 @@ def whole_rate(rate: float, field: str, value: object) -> int:
     """
     if rate != round(rate):
         raise FieldError(
-            field, value, f"has {rate} frames a second, which is no whole number",
+            field,
+            value,
+            f"has {rate} frames a second, which is no whole number",
             "record or convert it at a rate that is",
-        )  # fmt: skip
+        )
     return round(rate)
 
 
@@ -139,9 +146,11 @@ def observed_range(meta: Any) -> tuple[list[float], list[float]]:
     """
     if not parquet_files(Path(meta.root)):
         raise FieldError(
-            "dataset.root", meta.root, "has no files of data here, which say in what range its actions are",
+            "dataset.root",
+            meta.root,
+            "has no files of data here, which say in what range its actions are",
             "download it: leave out `--dataset.streaming`",
-        )  # fmt: skip
+        )
     actions = read_vectors(Path(meta.root), ACTION)
     finite = actions[np.isfinite(actions).all(1)]
     if not len(finite):
@@ -160,9 +169,14 @@ def observed_range(meta: Any) -> tuple[list[float], list[float]]:
             "action %s: %d of %d recorded values lie outside of the range that is taken, %.4g to %.4g (they "
             "reach from %.4g to %.4g). If they are meant, write the range into meta/info.json: lists `low` "
             "and `high` in the `info` of the feature `action`",
-            names[component], ((finite < low) | (finite > high)).sum(0)[component], len(finite),
-            low[component], high[component], least[component], most[component],
-        )  # fmt: skip
+            names[component],
+            ((finite < low) | (finite > high)).sum(0)[component],
+            len(finite),
+            low[component],
+            high[component],
+            least[component],
+            most[component],
+        )
     return low.tolist(), high.tolist()
 
 
@@ -176,15 +190,19 @@ def check_range(
     for name, end in ((LOW, low), (HIGH, high)):
         if len(end) != len(names):
             raise FieldError(
-                setting.format(name), list(end), f"the dataset's action has {len(names)} components: "
-                f"{', '.join(names)}", "give one number for each",
-            )  # fmt: skip
+                setting.format(name),
+                list(end),
+                f"the dataset's action has {len(names)} components: {', '.join(names)}",
+                "give one number for each",
+            )
     for name, least, most in zip(names, low, high, strict=True):
         if not (np.isfinite([least, most]).all() and least <= most):
             raise FieldError(
-                setting.format(LOW), list(low), f"{name} would range from {least} to {most}",
+                setting.format(LOW),
+                list(low),
+                f"{name} would range from {least} to {most}",
                 "give finite numbers, the lower end first",
-            )  # fmt: skip
+            )
 
 
 def check_same_robot(embodiment: Embodiment, meta: Any) -> None:
@@ -197,11 +215,16 @@ def check_same_robot(embodiment: Embodiment, meta: Any) -> None:
         unnamed = any(each and each[0].isdigit() for each in (*parts[:1], *names[:1]))
         if names and parts and not unnamed and names != parts:
             raise FieldError(
-                "dataset.root", meta.root, f"its {column} has the components {', '.join(parts)}, the world "
-                f"model has learnt {', '.join(names)}", "use a dataset of the same robot",
-            )  # fmt: skip
+                "dataset.root",
+                meta.root,
+                f"its {column} has the components {', '.join(parts)}, the world "
+                f"model has learnt {', '.join(names)}",
+                "use a dataset of the same robot",
+            )
     if embodiment.fps and embodiment.fps != meta.fps:
         raise FieldError(
-            "dataset.root", meta.root, f"has {meta.fps} frames a second, the world model has learnt "
-            f"{embodiment.fps}", "use a dataset of the same frame rate",
-        )  # fmt: skip
+            "dataset.root",
+            meta.root,
+            f"has {meta.fps} frames a second, the world model has learnt {embodiment.fps}",
+            "use a dataset of the same frame rate",
+        )

@@ -120,9 +120,12 @@ class EpisodeTable:
         """Return some of the episodes, a mask (E,) or indices; `validation` means nothing in the result."""
         columns = {name: values[episodes] for name, values in self.columns.items()}
         return replace(
-            self, start=self.start[episodes], length=self.length[episodes], columns=columns,
+            self,
+            start=self.start[episodes],
+            length=self.length[episodes],
+            columns=columns,
             instructions=np.array(self.instructions, object)[episodes].tolist(),
-        )  # fmt: skip
+        )
 
     def among(self, chosen: Sequence[int] | None) -> np.ndarray:
         """Mark the episodes that are `chosen`, all if None. FieldError names one that does not exist. (E,)"""
@@ -143,9 +146,11 @@ def require_episodes(name: str, chosen: Collection[int], total: int, root: Path)
     for episode in chosen:
         if not 0 <= episode < total:
             raise FieldError(
-                name, chosen if isinstance(chosen, dict) else list(chosen),
-                f"there is no episode {episode} in {root}", f"it has episodes 0 to {total - 1}",
-            )  # fmt: skip
+                name,
+                chosen if isinstance(chosen, dict) else list(chosen),
+                f"there is no episode {episode} in {root}",
+                f"it has episodes 0 to {total - 1}",
+            )
 
 
 def count_tasks(tables: Sequence[EpisodeTable]) -> int:
@@ -163,18 +168,7 @@ def count_tasks(tables: Sequence[EpisodeTable]) -> int:
 
 def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     """Read the columns that models train on. FieldError names a missing one, or one with NaN or infinity."""
-    if ACTION not in dataset.features:
-        raise FieldError(
-            "dataset.root", dataset.root,
-            f"the feature {ACTION!r} is missing (it has {', '.join(dataset.features)})",
-            "world models need what was done beside what was seen",
-        )  # fmt: skip
-    for name in (ACTION, OBS_STATE):
-        if len(shape := dataset.features.get(name, {"shape": (1,)})["shape"]) != 1:
-            raise FieldError(
-                "dataset.root", dataset.root, f"{name} has the shape {tuple(shape)}, which is no vector",
-                "store it as one, as LeRobot's policies read it",
-            )  # fmt: skip
+    require_vectors(dataset)
     success = success_column(dataset.features)
     labels = () if success is None else (success,)
     measured = [name for name in (ACTION, OBS_STATE, *labels) if name in dataset.features]
@@ -196,8 +190,9 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
         logging.warning(
             "%s: most episodes end as soon as they succeed, so that no frame shows success. The last %d "
             "frames of those that do are taken for solved; record a few more, if you can",
-            dataset.root, SOLVED_FRAMES,
-        )  # fmt: skip
+            dataset.root,
+            SOLVED_FRAMES,
+        )
         inferred = solved_at_end(done, start[ending], length[ending])
     return EpisodeTable(
         dataset=dataset,
@@ -210,6 +205,25 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
         columns={name: np.asarray(rows[name]).reshape(-1)[start] for name in further},
         inferred_success=inferred,
     )
+
+
+def require_vectors(dataset: LeRobotDataset) -> None:
+    """Raise FieldError unless a dataset has actions, and these and its states, if any, are vectors."""
+    if ACTION not in dataset.features:
+        raise FieldError(
+            "dataset.root",
+            dataset.root,
+            f"the feature {ACTION!r} is missing (it has {', '.join(dataset.features)})",
+            "world models need what was done beside what was seen",
+        )
+    for name in (ACTION, OBS_STATE):
+        if len(shape := dataset.features.get(name, {"shape": (1,)})["shape"]) != 1:
+            raise FieldError(
+                "dataset.root",
+                dataset.root,
+                f"{name} has the shape {tuple(shape)}, which is no vector",
+                "store it as one, as LeRobot's policies read it",
+            )
 
 
 def end_at_success(done: np.ndarray, start: np.ndarray, length: np.ndarray) -> np.ndarray:
@@ -238,8 +252,11 @@ def first_instructions(dataset: LeRobotDataset, task: np.ndarray, start: np.ndar
     if several := int((ends[0] != ends[1]).sum()):
         logging.warning(
             "%s: the instruction changes within %d of %d episodes; that of the first frame is taken for the "
-            "whole episode", dataset.root, several, len(start),
-        )  # fmt: skip
+            "whole episode",
+            dataset.root,
+            several,
+            len(start),
+        )
     texts = {int(index): str(text) for text, index in dataset.meta.tasks["task_index"].items()}
     return [texts[index] for index in task[start].tolist()]
 
@@ -273,11 +290,14 @@ def truth_of(dataset: LeRobotDataset, column: str, values: ArrayLike) -> np.ndar
     if other.any():
         row = int(np.argmax(other))
         raise bad_row(
-            dataset, column, row, f"{values[row]}, neither true nor false",
+            dataset,
+            column,
+            row,
+            f"{values[row]}, neither true nor false",
             "take numbers from a threshold on for true: lerobot-wmrl-label "
             f"{flag_as_typed('dataset.root', dataset.root)} --success.type=column "
             f"--success.column={column} --success.threshold=…",
-        )  # fmt: skip
+        )
     return values.astype(bool)
 
 
@@ -293,11 +313,13 @@ def bad_row(
     episode = int(episodes[row])
     frame = row - int(np.argmax(np.asarray(episodes) == episode))
     return FieldError(
-        "dataset.root", dataset.root, f"{column} of episode {episode}, frame {frame}, is {value}",
+        "dataset.root",
+        dataset.root,
+        f"{column} of episode {episode}, frame {frame}, is {value}",
         remedy
         or "remove the episode: "
         + edit_advice(dataset.root, "delete_episodes", {"operation.episode_indices": [episode]}),
-    )  # fmt: skip
+    )
 
 
 def parquet_files(root: Path) -> list[Path]:
@@ -314,9 +336,12 @@ def read_vectors(root: Path, name: str) -> np.ndarray:
 
 
 def choose_episodes(
-    table: EpisodeTable, split: str, at_most: int, further: Mapping[str, np.ndarray] | None = None,
+    table: EpisodeTable,
+    split: str,
+    at_most: int,
+    further: Mapping[str, np.ndarray] | None = None,
     wanted: np.ndarray | None = None,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Choose at most `at_most` episodes, evenly spread, that belong to every split named in `split`.
 
     Args:

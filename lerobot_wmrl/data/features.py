@@ -26,11 +26,15 @@ def episode_features(observation: Observation, robot: Embodiment, camera: str) -
     return {
         **observation_features(observation, robot.state_names, camera),
         ACTION: {
-            "dtype": "float32", "shape": (len(robot.action_names),), "names": robot.action_names,
+            "dtype": "float32",
+            "shape": (len(robot.action_names),),
+            "names": robot.action_names,
             "info": {LOW: robot.action_low, HIGH: robot.action_high},
         },
-        "next.reward": number, "next.success": flag, "next.done": flag,
-    }  # fmt: skip
+        "next.reward": number,
+        "next.success": flag,
+        "next.done": flag,
+    }
 
 
 def observation_row(observation: Observation, row: int) -> dict[str, np.ndarray]:
@@ -79,9 +83,11 @@ def matched(recorded: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str
         actual, needed = _kept_as(found), _kept_as(feature)
         if actual != needed and not (found and _holds(feature, found)):
             raise FieldError(
-                "like.root", name, f"the dataset has it as {needed}, a rollout has {actual}",
+                "like.root",
+                name,
+                f"the dataset has it as {needed}, a rollout has {actual}",
                 "give `like_columns=false`, and the recording as `dataset.more` to what learns from it",
-            )  # fmt: skip
+            )
         if "info" in feature and feature["dtype"] == "video":
             feature.pop("info")  # the encoder's, which LeRobot writes
     return wanted
@@ -103,13 +109,15 @@ def _is_number(feature: Mapping[str, Any]) -> bool:
 def _holds(feature: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Whether a column of numbers can hold another: whole ones hold no fractions, and flags no numbers."""
     return (
-        _is_number(feature) and _is_number(other)
+        _is_number(feature)
+        and _is_number(other)
         and tuple(feature["shape"]) == tuple(other["shape"])
         and np.can_cast(
-            other["dtype"], feature["dtype"],
+            other["dtype"],
+            feature["dtype"],
             "same_kind" if str(other["dtype"]).startswith("float") else "safe",
         )
-    )  # fmt: skip
+    )
 
 
 def _kept_as(feature: Mapping[str, Any] | None) -> str:

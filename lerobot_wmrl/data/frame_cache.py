@@ -126,9 +126,14 @@ def cached_context(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenize
     path = encoded_path("context", dataset, camera_keys, tokenizer)
     shape = (len(starts), *context(blank(frames)).shape[1:])
     return LazyRows(
-        path, shape, np.float32, np.arange(len(starts)), lambda rows: context(frames[starts[rows]]), ENCODED,
+        path,
+        shape,
+        np.float32,
+        np.arange(len(starts)),
+        lambda rows: context(frames[starts[rows]]),
+        ENCODED,
         "Encoding contexts",
-    )  # fmt: skip
+    )
 
 
 def cached_features(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder) -> LazyRows:
@@ -143,9 +148,14 @@ def cached_features(dataset: LeRobotDataset, camera_keys: Sequence[str], tokeniz
     path = encoded_path("features", dataset, camera_keys, tokenizer)
     shape = (len(frames), *features(blank(frames), blank(frames)).shape[1:])
     return LazyRows(
-        path, shape, np.float32, starts,
-        lambda rows: features(frames[first_rows(starts, rows)], frames[rows]), ENCODED, "Encoding features",
-    )  # fmt: skip
+        path,
+        shape,
+        np.float32,
+        starts,
+        lambda rows: features(frames[first_rows(starts, rows)], frames[rows]),
+        ENCODED,
+        "Encoding features",
+    )
 
 
 def episode_starts(dataset: LeRobotDataset) -> np.ndarray:
@@ -153,9 +163,11 @@ def episode_starts(dataset: LeRobotDataset) -> np.ndarray:
     starts = np.asarray(dataset.meta.episodes["dataset_from_index"][:])  # slow row by row
     if (np.diff(starts) <= 0).any():
         raise FieldError(
-            "dataset.root", dataset.root, "its episodes' rows do not follow each other",
+            "dataset.root",
+            dataset.root,
+            "its episodes' rows do not follow each other",
             "write it anew with lerobot-edit-dataset",
-        )  # fmt: skip
+        )
     return starts
 
 
@@ -283,10 +295,11 @@ def depth_of_windows(
     farthest = max(each.max().item() for each in given)
     if 0 < farthest < NEAREST:
         raise FieldError(
-            "dataset.depth_output_unit", "m",
+            "dataset.depth_output_unit",
+            "m",
             f"no depth of this batch is above {MM_PER_METRE * farthest:.3g} mm, so it is in metres",
             "leave it out: world models read millimetres",
-        )  # fmt: skip
+        )
     least = [none + ROUNDING_METRES for none in unmeasured]
     maps = [torch.where(each > at, each, 0.0) for each, at in zip(given, least, strict=True)]
     cameras = [token_depth(each.flatten(0, 1), grid).unflatten(0, each.shape[:2]) for each in maps]

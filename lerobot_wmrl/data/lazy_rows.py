@@ -45,9 +45,15 @@ class LazyRows:
     """
 
     def __init__(
-        self, path: Path, shape: tuple[int, ...], dtype: type, starts: np.ndarray,
-        compute: Callable[[np.ndarray], np.ndarray], at_once: int, description: str,
-    ) -> None:  # fmt: skip
+        self,
+        path: Path,
+        shape: tuple[int, ...],
+        dtype: type,
+        starts: np.ndarray,
+        compute: Callable[[np.ndarray], np.ndarray],
+        at_once: int,
+        description: str,
+    ) -> None:
         self.path, self.shape, self.dtype = path, shape, np.dtype(dtype)
         self._compute, self._at_once, self._description = compute, at_once, description
         bounds = zip(starts, [*starts[1:], shape[0]], strict=True)
@@ -177,7 +183,8 @@ def room_in(folder: Path) -> Iterator[None]:
         if error.errno not in NOT_WRITABLE:
             raise
         raise FieldError(
-            "dataset.root", folder.with_suffix(""),
+            "dataset.root",
+            folder.with_suffix(""),
             f"its decoded frames are kept in {folder}, which cannot be written ({error})",
             "make room, or copy the dataset, or make a symbolic link to it, where you may write",
-        ) from error  # fmt: skip
+        ) from error

@@ -82,9 +82,11 @@ class Entries:
             count, left = wanted.get(name, 0), limit - spent[name]
             if count and count > left:
                 raise FieldError(
-                    "budget", path, f"{count} more {name} are wanted, {left} of {limit} are left",
+                    "budget",
+                    path,
+                    f"{count} more {name} are wanted, {left} of {limit} are left",
                     "record fewer, or give every method that is compared a larger limit",
-                )  # fmt: skip
+                )
 
 
 @dataclass(frozen=True)
@@ -103,9 +105,11 @@ class Ledger:
                 ledger._write(Entries(limits))
             elif (stored := ledger.read().limits) != limits:
                 raise FieldError(
-                    "budget", path, f"has other limits ({asdict(stored)}) than {asdict(limits)}",
+                    "budget",
+                    path,
+                    f"has other limits ({asdict(stored)}) than {asdict(limits)}",
                     "repeat its limits, or choose another file",
-                )  # fmt: skip
+                )
         return ledger
 
     def read(self) -> Entries:
@@ -170,11 +174,12 @@ class Ledger:
         unknown = [int(episode) for episode in chosen if digests[episode] not in known]
         if unknown:
             raise FieldError(
-                "dataset.root", table.dataset.root,
+                "dataset.root",
+                table.dataset.root,
                 f"{len(unknown)} of {len(chosen)} episodes are not in the budget {self.path}, the first is "
                 f"episode {unknown[0]}",
                 f"record them with lerobot-wmrl-record --budget={self.path}, or choose others",
-            )  # fmt: skip
+            )
 
     @contextmanager
     def _changing(self) -> Iterator[Entries]:

@@ -8,10 +8,10 @@ from typing import Any, Final
 from lerobot_wmrl.common.checkpoints import last_model
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
-from lerobot_wmrl.common.flags import Flags, env_flags, format_flags
+from lerobot_wmrl.common.flags import Flags, env_flags, program_call
 from lerobot_wmrl.common.lerobot_commands import train_command
 from lerobot_wmrl.common.policies import read_policy_config
-from lerobot_wmrl.common.presets import preset_flags, presets_of
+from lerobot_wmrl.common.presets import preset_settings, presets_of
 from lerobot_wmrl.common.seeds import EVALUATION_SEED, require_seed
 from lerobot_wmrl.common.stages import Stage
 from lerobot_wmrl.common.tracking import read_metrics
@@ -82,9 +82,11 @@ class DemoConfig(RunConfig):
         fewest, most = VALIDATION_EVERY - self.demonstrations, SEEDS_A_DEMO - ROLLOUT_SEED_OFFSET
         if not max(1, fewest) <= self.rollouts <= most:
             raise FieldError(
-                "rollouts", self.rollouts, f"must be from {max(1, fewest)}, so that an episode is held out, "
+                "rollouts",
+                self.rollouts,
+                f"must be from {max(1, fewest)}, so that an episode is held out, "
                 f"to {most}, the seeds there are",
-            )  # fmt: skip
+            )
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,9 @@ class Demo:
             "in imagination, from frames of the dataset": self.out / "imagined",
         }
         return Page(
-            improvement, "Is the world model worth it?", self.config.seed,
+            improvement,
+            "Is the world model worth it?",
+            self.config.seed,
             stage_records(self.out, self.stages()),
             [read_place(where, folder, titles) for where, folder in folders.items()],
             {"held out": self.out / "replay"},
@@ -123,7 +127,7 @@ class Demo:
                 "BC of the demonstrations": lerobot_train_curve(self.out / "logs" / "cloned.log"),
                 "Text world model": curve(read_metrics(self.out / "text_world_model"), "loss"),
             },
-        )  # fmt: skip
+        )
 
     @property
     def out(self) -> Path:
@@ -140,20 +144,30 @@ class Demo:
 
     def improvement(self) -> Progress:
         """Return what the stage `improve` does, once there is a policy to improve."""
-        return Progress(Plan.of(ImproveConfig(
-            policy=read_policy_config(self._policy, []), dataset=ChosenEpisodes(root=self._recorded),
-            real_env=WmrlManiSkillEnv(**KNOWN), **self._given,
-        )))  # fmt: skip
+        return Progress(
+            Plan.of(
+                ImproveConfig(
+                    policy=read_policy_config(self._policy, []),
+                    dataset=ChosenEpisodes(root=self._recorded),
+                    real_env=WmrlManiSkillEnv(**KNOWN),
+                    **self._given,
+                )
+            )
+        )
 
     @property
     def _given(self) -> dict[str, Any]:
         """Settings of the improvement beside policy, dataset and environment. No episode in ManiSkill chooses
         anything: what is compared has learnt from the same episodes."""
         return {
-            "rollouts": self.config.rollouts, "exploration": EXPLORATION, "size": self.config.size,
-            "selection_episodes": 0, "eval_episodes": self.config.eval_episodes, "seed": self.first_seed,
+            "rollouts": self.config.rollouts,
+            "exploration": EXPLORATION,
+            "size": self.config.size,
+            "selection_episodes": 0,
+            "eval_episodes": self.config.eval_episodes,
+            "seed": self.first_seed,
             "output_dir": self.improved,
-        }  # fmt: skip
+        }
 
     @property
     def _recorded(self) -> str:
@@ -164,41 +178,65 @@ class Demo:
         return str(last_model(self.out / "cloned"))
 
     def _demonstrations(self) -> list[str]:
-        return self._command("lerobot-wmrl-record", {
-            "kinds": "{human_like: 1}", "num_episodes": self.config.demonstrations, "video": False,
-            **env_flags(WmrlManiSkillEnv(**KNOWN)), "seed": self.first_seed, "output_dir": self._recorded,
-        })  # fmt: skip
+        return self._command(
+            "lerobot-wmrl-record",
+            {
+                "kinds": "{human_like: 1}",
+                "num_episodes": self.config.demonstrations,
+                "video": False,
+                **env_flags(WmrlManiSkillEnv(**KNOWN)),
+                "seed": self.first_seed,
+                "output_dir": self._recorded,
+            },
+        )
 
     def _cloned(self) -> list[str]:
         """Clone the policy `cnn` by LeRobot's own command."""
-        files: Flags = {
-            "policy.type": "cnn", "policy.push_to_hub": False, "dataset.repo_id": "local/demonstrations",
-            "dataset.root": self._recorded, "seed": self.first_seed,
-        }  # fmt: skip
-        flags = [*preset_flags(self.config.size, "sft"), *format_flags(files)]
-        return train_command(self.out / "cloned", flags)
+        settings = {
+            **preset_settings(self.config.size, "sft"),
+            "policy.type": "cnn",
+            "policy.push_to_hub": False,
+            "dataset.repo_id": "local/demonstrations",
+            "dataset.root": self._recorded,
+            "seed": self.first_seed,
+        }
+        return train_command(self.out / "cloned", settings)
 
     def _improve(self) -> list[str]:
-        return ["lerobot-wmrl-improve", *format_flags({
-            "policy.path": self._policy, "dataset.root": self._recorded,
-            **env_flags(WmrlManiSkillEnv(**KNOWN), "real_env"), **self._given,
-            "output_dir": str(self.improved),
-        })]  # fmt: skip
+        return program_call(
+            "lerobot-wmrl-improve",
+            {
+                "policy.path": self._policy,
+                "dataset.root": self._recorded,
+                **env_flags(WmrlManiSkillEnv(**KNOWN), "real_env"),
+                **self._given,
+                "output_dir": str(self.improved),
+            },
+        )
 
     def _text_world_model(self) -> list[str]:
-        return self._command("lerobot-wmrl-train-world-model", {
-            "model.type": "text_world_model",
-            "model.tokenizer_path": str(self.improved / StageName.TOKENIZER),
-            "dataset.root": str(self.improved / StageName.MERGED), "seed": self.first_seed,
-            "output_dir": str(self.out / "text_world_model"),
-        })  # fmt: skip
+        return self._command(
+            "lerobot-wmrl-train-world-model",
+            {
+                "model.type": "text_world_model",
+                "model.tokenizer_path": str(self.improved / StageName.TOKENIZER),
+                "dataset.root": str(self.improved / StageName.MERGED),
+                "seed": self.first_seed,
+                "output_dir": str(self.out / "text_world_model"),
+            },
+        )
 
     def _replay(self) -> list[str]:
-        return self._command("lerobot-wmrl-eval-world-model", {
-            "model.path": str(self.improved / StageName.WORLD_MODEL), "split": "validation",
-            "text_model.path": str(self.out / "text_world_model"),
-            "dataset.root": str(self.improved / StageName.MERGED), "output_dir": str(self.out / "replay"),
-        })  # fmt: skip
+        return self._command(
+            "lerobot-wmrl-eval-world-model",
+            {
+                "model.path": str(self.improved / StageName.WORLD_MODEL),
+                "split": "validation",
+                "text_model.path": str(self.out / "text_world_model"),
+                "dataset.root": str(self.improved / StageName.MERGED),
+                "output_dir": str(self.out / "replay"),
+            },
+        )
 
     def _unseen(self) -> list[str]:
         env = env_flags(WmrlManiSkillEnv(**UNSEEN))
@@ -213,13 +251,17 @@ class Demo:
 
     def _command(self, program: str, flags: Flags) -> list[str]:
         """Return a command of this package, at the demo's size."""
-        return [program, f"--preset={self.config.size}", *format_flags(flags)]
+        return program_call(program, {"preset": self.config.size, **flags})
 
 
 def conclusion(page: Page, path: Path) -> str:
     """Say in a few lines what the demo made, how good it is, and what comes next."""
-    return "\n".join([
-        verdict(page.progress, page.places), "", f"The report: {path}",
-        "Next: open it; it ends with every command, to change and run by hand. Drive the world model:",
-        shlex.join(commands.drive_command(page.progress)),
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            verdict(page.progress, page.places),
+            "",
+            f"The report: {path}",
+            "Next: open it; it ends with every command, to change and run by hand. Drive the world model:",
+            shlex.join(commands.drive_command(page.progress)),
+        ]
+    )

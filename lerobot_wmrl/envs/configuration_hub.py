@@ -38,9 +38,11 @@ class HubEnv(EnvConfig):
         self.features_map.clear()
         if self.hub_path and not self.trust_remote_code:
             raise FieldError(
-                "trust_remote_code", False, f"the code of {self.hub_path} would run on this machine",
+                "trust_remote_code",
+                False,
+                f"the code of {self.hub_path} would run on this machine",
                 "read it, then set this to true",
-            )  # fmt: skip
+            )
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -66,10 +68,11 @@ class HubEnv(EnvConfig):
         counts = {env.num_envs for env in every}
         if counts != {n_envs}:
             raise FieldError(
-                "hub_path", self.hub_path,
+                "hub_path",
+                self.hub_path,
                 f"asked for {n_envs} environments at once, its make_env made {sorted(counts) or 'none'}",
                 "it must heed `n_envs`; or ask for one at a time",
-            )  # fmt: skip
+            )
         space = every[0].single_action_space
         if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
             raise FieldError(

@@ -53,36 +53,47 @@ class StartFrames(ChosenEpisodes):
         if len(chosen) != 1:
             named = " and ".join(chosen).replace("given", "a dataset") or "nothing"
             raise FieldError(
-                "dataset.root", self.name, f"starts are given by {named}",
+                "dataset.root",
+                self.name,
+                f"starts are given by {named}",
                 "give one of `dataset.root`, `dataset.repo_id`, `dataset.frames` and `dataset.resets`",
-            )  # fmt: skip
+            )
         if self.branches < 0 or (self.branches and not self.given):
             raise FieldError(
-                "dataset.branches", self.branches,
+                "dataset.branches",
+                self.branches,
                 "imagined episodes branch off from episodes of a dataset, at least 0 times",
                 "give a dataset; saved frames and resets are first frames",
-            )  # fmt: skip
+            )
         if self.branches >= self.max_starts:
             raise FieldError(
-                "dataset.branches", self.branches,
+                "dataset.branches",
+                self.branches,
                 f"an episode with so many branches has more than the {self.max_starts} starts of "
-                "`dataset.max_starts`", "raise that, or lower this",
-            )  # fmt: skip
+                "`dataset.max_starts`",
+                "raise that, or lower this",
+            )
         if self.episodes is not None and not self.given:
             raise FieldError(
-                "dataset.episodes", self.episodes, "chooses episodes of a dataset, and there is none",
+                "dataset.episodes",
+                self.episodes,
+                "chooses episodes of a dataset, and there is none",
                 "leave it out",
-            )  # fmt: skip
+            )
         if self.frames and (self.tasks or self.scenes or self.split != "all"):
             raise FieldError(
-                "dataset.frames", self.frames, "saved frames do not say their task, scene or split",
+                "dataset.frames",
+                self.frames,
+                "saved frames do not say their task, scene or split",
                 "leave out `dataset.tasks`, `dataset.scenes` and `dataset.split`",
-            )  # fmt: skip
+            )
         if self.resets and self.split not in ("all", "ind", "ood"):
             raise FieldError(
-                "dataset.split", self.split, "no world model was trained on ManiSkill's resets",
+                "dataset.split",
+                self.split,
+                "no world model was trained on ManiSkill's resets",
                 "choose ind or ood",
-            )  # fmt: skip
+            )
         if self.resets < 0:
             raise FieldError("dataset.resets", self.resets, "must be at least 1")
 
@@ -127,17 +138,21 @@ class WorldModelEnv(EnvConfig):
             return
         if getattr(self.reward, "needs_goal", False) and not self.text_world_model_path:
             raise FieldError(
-                "text_world_model_path", "", "the dense part of the general reward needs goal frames",
+                "text_world_model_path",
+                "",
+                "the dense part of the general reward needs goal frames",
                 "give a text world model, or set `reward.alpha` to 1",
-            )  # fmt: skip
+            )
         from lerobot_wmrl.world_models.checkpoint import read_config
 
         model = read_config(self.world_model_path, "action_world_model")
         if self.fps not in (0, model.embodiment.fps):
             raise FieldError(
-                "fps", self.fps, f"the world model has learnt {model.embodiment.fps} frames a second",
+                "fps",
+                self.fps,
+                f"the world model has learnt {model.embodiment.fps} frames a second",
                 "leave it out",
-            )  # fmt: skip
+            )
         self._check_rewarding(model)
         self.fps, self.episode_length = model.embodiment.fps, self.episode_length or model.clip_length
         self._check_length()
@@ -165,11 +180,12 @@ class WorldModelEnv(EnvConfig):
         success_alone = isinstance(self.reward, GeneralConfig) and not self.reward.needs_goal
         if model.learnt_successes == 0 and success_alone:
             raise FieldError(
-                "world_model_path", self.world_model_path,
+                "world_model_path",
+                self.world_model_path,
                 "has learnt from no episode that is known to succeed, so it would never reward",
                 "label the episodes with lerobot-wmrl-label and train it again, or choose another reward "
                 "(`reward.type`)",
-            )  # fmt: skip
+            )
 
     def _check_length(self) -> None:
         if self.episode_length is None:
@@ -177,10 +193,12 @@ class WorldModelEnv(EnvConfig):
         require_at_least(self, 1, "episode_length")
         if self.episode_length < self.done_frames:
             raise FieldError(
-                "episode_length", self.episode_length,
+                "episode_length",
+                self.episode_length,
                 f"shorter than the {self.done_frames} frames for which done must hold, so that no episode "
-                "could succeed", "raise it, or lower `done_frames`",
-            )  # fmt: skip
+                "could succeed",
+                "raise it, or lower `done_frames`",
+            )
 
     @property
     def horizon(self) -> int:

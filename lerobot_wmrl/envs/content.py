@@ -17,9 +17,10 @@ def content_of(env: EnvConfig | None) -> dict[str, str]:
     if not isinstance(env, WorldModelEnv):
         return {}
     models = {
-        "world_model_path": env.world_model_path, "text_world_model_path": env.text_world_model_path,
+        "world_model_path": env.world_model_path,
+        "text_world_model_path": env.text_world_model_path,
         "reward.pretrained_path": getattr(env.reward, "pretrained_path", None),
-    }  # fmt: skip
+    }
     content = {name: digest_of_setting(name, path, model_digest) for name, path in models.items() if path}
     if env.dataset.given:
         content["dataset"] = fingerprint(Path(env.dataset.open().root))
@@ -39,6 +40,8 @@ def digest_of_setting(name: str, path: str | Path, digest: Callable[[Path], str]
         return digest(Path(path))
     except (OSError, ValueError) as error:  # the hub's client raises both
         raise FieldError(
-            name, path, f"nothing can be read there ({first_line(error)})",
+            name,
+            path,
+            f"nothing can be read there ({first_line(error)})",
             "give the output folder of its training, a file that is there, or a hub id",
-        ) from error  # fmt: skip
+        ) from error

@@ -98,9 +98,11 @@ def check_real_env(policy: PreTrainedConfig, config: EnvConfig, starts: int = 0)
     try:
         if counts_resets(config) and (known := len(env.envs[0].get_wrapper_attr("_init_states"))) < starts:
             raise FieldError(
-                "real_env.init_states", True, f"{config.type} has {known} starts for a task, policies are "
-                f"measured on {starts}", "set it to false, or lower `eval_episodes` and `selection_episodes`",
-            )  # fmt: skip
+                "real_env.init_states",
+                True,
+                f"{config.type} has {known} starts for a task, policies are measured on {starts}",
+                "set it to false, or lower `eval_episodes` and `selection_episodes`",
+            )
         shown = shapes_of(env.reset()[0])
     finally:
         env.close()
@@ -127,10 +129,12 @@ def check_frame_rate(config: EnvConfig, fps: int, where: str) -> None:
     """Raise FieldError unless `real_env` has as many frames a second as the data that is learnt from."""
     if config.fps != fps:
         raise FieldError(
-            "real_env.fps", config.fps, f"{where} has {fps} frames a second, and what is recorded in both is "
+            "real_env.fps",
+            config.fps,
+            f"{where} has {fps} frames a second, and what is recorded in both is "
             "learnt from, or checked on, together",
             f"set it to {fps} if the environment has that, or resample the dataset (lerobot-wmrl-resample)",
-        )  # fmt: skip
+        )
 
 
 class LeRobotTensorEnv(TensorEnv):
@@ -177,12 +181,14 @@ class LeRobotTensorEnv(TensorEnv):
         if beyond:
             logging.warning(
                 "env.type=%s: actions were learnt beyond the environment's action space, and may be taken "
-                "there: %s. Are they in the same units?", self.kind, ", ".join(
+                "there: %s. Are they in the same units?",
+                self.kind,
+                ", ".join(
                     f"component {at} {low[at]:.4g} to {high[at]:.4g} (in the environment "
                     f"{self.action_low[at]:.4g} to {self.action_high[at]:.4g})"
                     for at in beyond
                 ),
-            )  # fmt: skip
+            )
         self.action_low = torch.minimum(self.action_low, low)
         self.action_high = torch.maximum(self.action_high, high)
 
@@ -217,9 +223,13 @@ class LeRobotTensorEnv(TensorEnv):
             self._seen[row] = self._observe(row, observation)
         terminated, truncated, success = map(self._vector, flags)
         return Outcome(
-            self._stacked(self._seen), self._vector(reward), terminated, truncated, success,
+            self._stacked(self._seen),
+            self._vector(reward),
+            terminated,
+            truncated,
+            success,
             self._vector(self._length.copy()),
-        )  # fmt: skip
+        )
 
     def _restart(self, ended: Tensor, outcome: Outcome) -> Observation:
         for row in ended.nonzero()[:, 0].tolist():
@@ -275,17 +285,21 @@ def _members(config: EnvConfig, each: int) -> list[list[gym.Env]]:
     their code would come from the hub."""
     if isinstance(config, HubEnvConfig):
         raise FieldError(
-            "type", config.type, "its code lies on the hub, and this command does not run that of this type",
+            "type",
+            config.type,
+            "its code lies on the hub, and this command does not run that of this type",
             "choose another; lerobot-wmrl-compare takes it, with --trust_remote_code=true",
-        )  # fmt: skip
+        )
     made = make_env(config, each, use_async_envs=False)
     tasks = [env for suite in made.values() for env in suite.values()]
     for env in tasks:
         if not isinstance(env, gym.vector.SyncVectorEnv):
             raise FieldError(
-                "type", config.type, f"makes a {type(env).__name__}, whose episodes cannot begin one by one",
+                "type",
+                config.type,
+                f"makes a {type(env).__name__}, whose episodes cannot begin one by one",
                 "it must make a gymnasium.vector.SyncVectorEnv where `use_async_envs` is false",
-            )  # fmt: skip
+            )
     return [list(env.envs) for env in tasks]
 
 
@@ -293,9 +307,11 @@ def _frame_limit(config: EnvConfig, env: gym.Env) -> int:
     """Return the most frames of an episode. FieldError if the environment does not say it."""
     if not env.has_wrapper_attr(FRAME_LIMIT):
         raise FieldError(
-            "type", config.type, f"does not say after how many frames an episode ends (`{FRAME_LIMIT}`)",
+            "type",
+            config.type,
+            f"does not say after how many frames an episode ends (`{FRAME_LIMIT}`)",
             "make the environment by gymnasium.make, with `max_episode_steps`",
-        )  # fmt: skip
+        )
     return int(env.get_wrapper_attr(FRAME_LIMIT))
 
 

@@ -173,9 +173,13 @@ class ManiSkillTensorEnv(TensorEnv):
             length = np.where(ended, self._info["final_info"]["episode_length"], length)
         terminated, truncated = map(self._vector, ends)
         return Outcome(
-            self._tensors(last, self._instructions), self._vector(reward).float(), terminated, truncated,
-            terminated, self._vector(length),
-        )  # fmt: skip
+            self._tensors(last, self._instructions),
+            self._vector(reward).float(),
+            terminated,
+            truncated,
+            terminated,
+            self._vector(length),
+        )
 
     def _restart(self, ended: Tensor, outcome: Outcome) -> Observation:
         self._instructions = [

@@ -59,10 +59,17 @@ class RolloutRecorder:
     """
 
     def __init__(
-        self, env: EnvConfig, policy: PreTrainedConfig, robot: Embodiment | None, exploration: float = 0.0,
-        like: Any | None = None, num_envs: int = 1, video: bool = False, like_columns: bool = True,
+        self,
+        env: EnvConfig,
+        policy: PreTrainedConfig,
+        robot: Embodiment | None,
+        exploration: float = 0.0,
+        like: Any | None = None,
+        num_envs: int = 1,
+        video: bool = False,
+        like_columns: bool = True,
         max_frames: int | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.config, self.exploration, self.video = env, exploration, video
         self.columns = like.features if like is not None and like_columns else None
         self.robot_type = like.robot_type if like is not None else None
@@ -84,14 +91,18 @@ class RolloutRecorder:
         except ValueError as error:  # LeRobot reads more codecs than it writes
             assert like is not None, "columns are those of `like`"
             raise FieldError(
-                "like.root", like.root, f"its videos cannot be encoded alike ({first_line(error)})",
+                "like.root",
+                like.root,
+                f"its videos cannot be encoded alike ({first_line(error)})",
                 "give `like_columns=false` if nothing is to be merged",
-            ) from error  # fmt: skip
+            ) from error
         if like is not None and like_columns and like.fps != env.fps:
             raise FieldError(
-                "like.root", like.root, f"has {like.fps} frames a second, the environment {env.fps}",
+                "like.root",
+                like.root,
+                f"has {like.fps} frames a second, the environment {env.fps}",
                 "give a dataset of the same rate, or `like_columns=false` if nothing is to be merged",
-            )  # fmt: skip
+            )
 
     def close(self) -> None:
         """Close the environments."""
@@ -121,8 +132,9 @@ class RolloutRecorder:
         if any(clipped) and self.range_is_guessed:
             logging.warning(
                 "the range is that of the action space of %s; if the environment takes more, record again "
-                "with `like.root`, a dataset of the same robot whose actions show it", self.config.type,
-            )  # fmt: skip
+                "with `like.root`, a dataset of the same robot whose actions show it",
+                self.config.type,
+            )
 
     def skip(self, seeds: Sequence[int]) -> None:
         """Pass over the starts of these seeds' episodes, which are recorded already, where resets count."""
@@ -144,9 +156,13 @@ class RolloutRecorder:
         recording = RecordingProcessors(*self.policy.processors, noises, self.robot)
         with seeded_context(seeds[0]):  # of a policy that draws its actions, as flows and diffusion do
             taken = rollout(
-                env, self.policy.policy, *self.env_processors, recording.preprocess, recording.postprocess,
+                env,
+                self.policy.policy,
+                *self.env_processors,
+                recording.preprocess,
+                recording.postprocess,
                 seeds=[*seeds, *spare],
-            )  # fmt: skip
+            )
         return recording, taken
 
     def _scale(self) -> np.ndarray:
@@ -157,15 +173,20 @@ class RolloutRecorder:
         whole = {"dtype": "int64", "shape": (1,), "names": None}
         recorded = {
             **episode_features(observation, self.robot, "video" if self.video else "image"),
-            START_SEED: whole, START_KIND: whole,
-        }  # fmt: skip
+            START_SEED: whole,
+            START_KIND: whole,
+        }
         features = recorded if self.columns is None else matched(recorded, self.columns)
         return LeRobotDataset.create(
-            f"local/{folder.name.strip('.')}", self.config.fps, features, root=folder,
-            robot_type=self.robot_type, rgb_encoder=self.encoder,
+            f"local/{folder.name.strip('.')}",
+            self.config.fps,
+            features,
+            root=folder,
+            robot_type=self.robot_type,
+            rgb_encoder=self.encoder,
             use_videos=any(feature["dtype"] == "video" for feature in features.values()),
             image_writer_threads=IMAGE_WRITERS,
-        )  # fmt: skip
+        )
 
     def _add_episode(
         self,
@@ -188,8 +209,9 @@ class RolloutRecorder:
                 "next.reward": np.array([float(taken["reward"][row, step])], np.float32),
                 "next.success": np.array([solved]),
                 "next.done": np.array([step == length - 1 if labelled else solved]),
-                START_SEED: np.array([seed]), START_KIND: np.array([KINDS.index(POLICY)]),
-            }  # fmt: skip
+                START_SEED: np.array([seed]),
+                START_KIND: np.array([KINDS.index(POLICY)]),
+            }
             kept = row_in(dataset.features, frame)
             dataset.add_frame({**kept, "task": (observation.get("task") or [""])[row]})
         save_episode(dataset)
@@ -240,9 +262,11 @@ def robot_of(config: EnvConfig, env: Any, like: Any | None) -> Embodiment:
         count = int(np.prod(like.features[ACTION]["shape"]))
         if count != len(low):
             raise FieldError(
-                "like.root", like.root, f"its actions have {count} components, the environment's {len(low)}",
+                "like.root",
+                like.root,
+                f"its actions have {count} components, the environment's {len(low)}",
                 "give a dataset of the same robot",
-            )  # fmt: skip
+            )
         embodiment = Embodiment()
         with renamed("dataset.root", "like.root"):
             if recorded_range(like.features[ACTION]) is None and bounded:
@@ -250,9 +274,11 @@ def robot_of(config: EnvConfig, env: Any, like: Any | None) -> Embodiment:
             return read_embodiment(like, embodiment)
     if not bounded:
         raise FieldError(
-            "env.type", config.type, "does not say between which values its actions are",
+            "env.type",
+            config.type,
+            "does not say between which values its actions are",
             "give a dataset of the same robot, `like.root` or `like.repo_id`",
-        )  # fmt: skip
+        )
     return Embodiment(config.fps, [str(index) for index in range(len(low))], low, high)
 
 
@@ -262,16 +288,19 @@ def widened(config: EnvConfig, low: list[float], high: list[float], like: Any) -
     beyond = [
         f"{name} {observed[0]:.4g} to {observed[1]:.4g} (in {config.type} {limits[0]:.4g} to {limits[1]:.4g})"
         for name, limits, observed in zip(
-            component_names(like.features[ACTION]), zip(low, high, strict=True),
-            zip(least, most, strict=True), strict=True,
+            component_names(like.features[ACTION]),
+            zip(low, high, strict=True),
+            zip(least, most, strict=True),
+            strict=True,
         )
         if observed[0] < limits[0] or observed[1] > limits[1]
-    ]  # fmt: skip
+    ]
     if beyond:
         logging.warning(
             "like.root: actions go beyond the environment's action space, and so may the policy's: %s. Are "
-            "they in the same units?", ", ".join(beyond),
-        )  # fmt: skip
+            "they in the same units?",
+            ", ".join(beyond),
+        )
     return Embodiment(action_low=np.minimum(low, least).tolist(), action_high=np.maximum(high, most).tolist())
 
 

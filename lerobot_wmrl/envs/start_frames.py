@@ -123,14 +123,18 @@ def check_starts(source: StartFrames, ledger: Ledger | None) -> None:
     if ledger is not None and not source.given:
         kind = "frames" if source.frames else "resets"
         raise FieldError(
-            f"dataset.{kind}", getattr(source, kind), "under a budget, episodes start in recorded ones",
+            f"dataset.{kind}",
+            getattr(source, kind),
+            "under a budget, episodes start in recorded ones",
             "give `dataset.root`",
-        )  # fmt: skip
+        )
     if source.resets and source.split == "ood":
         raise FieldError(
-            "dataset.split", "ood", "results are reported on unseen scenes: nothing may be learnt in them",
+            "dataset.split",
+            "ood",
+            "results are reported on unseen scenes: nothing may be learnt in them",
             "choose ind",
-        )  # fmt: skip
+        )
     if not source.given:
         return
     table = read_episodes(source.open())
@@ -170,10 +174,11 @@ def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> StartI
     check_dataset(config, table.dataset.meta)
     if source.branches and not tokenizer_config.context:
         raise FieldError(
-            "dataset.branches", source.branches,
+            "dataset.branches",
+            source.branches,
             "the world model is not shown how an episode began, so it cannot tell success from its middle on",
             "train its tokenizer with `model.tokenizer.context=true`, or leave `branches` out",
-        )  # fmt: skip
+        )
     return recorded_frames(
         table, branch_frames(table, chosen_episodes(table, source), source.branches), tokenizer_config
     )
@@ -275,9 +280,12 @@ def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> Star
     remedy = "start in the dataset's episodes (`dataset.root`)"
     side = maniskill_side(tokenizer_config, "dataset.resets", source.resets, remedy)
     env = WmrlManiSkillEnv(
-        task=tasks[0], split="ood" if source.split == "ood" else "ind", scenes=source.scenes,
-        cameras=list(tokenizer_config.cameras), image_size=side,
-    )  # fmt: skip
+        task=tasks[0],
+        split="ood" if source.split == "ood" else "ind",
+        scenes=source.scenes,
+        cameras=list(tokenizer_config.cameras),
+        image_size=side,
+    )
     with within("dataset"):
         scenes = env.selected_scenes()
     simulation = env.create_simulation()
@@ -302,10 +310,11 @@ def maniskill_side(tokenizer_config: TokenizerConfig, field: str, value: object,
     """
     if tokenizer_config.square_side is None:
         raise FieldError(
-            field, value,
+            field,
+            value,
             "ManiSkill's frames are squares of one size, those that the world model has learnt from are not",
             remedy,
-        )  # fmt: skip
+        )
     return tokenizer_config.square_side
 
 
@@ -313,6 +322,8 @@ def without_depth(model: WorldModelRewardModel) -> None:
     """Raise FieldError if the model looks at depth."""
     if model.config.depth:
         raise FieldError(
-            "dataset.root", None, "this world model looks at depth, which saved frames and resets lack",
+            "dataset.root",
+            None,
+            "this world model looks at depth, which saved frames and resets lack",
             "give a dataset that was recorded with depth",
-        )  # fmt: skip
+        )

@@ -48,9 +48,11 @@ class GoalFeatures(NamedTuple):
 
 @torch.no_grad()
 def load_starts(
-    frames: StartImages, model: ActionWorldModelRewardModel, text_model: TextWorldModelRewardModel | None,
+    frames: StartImages,
+    model: ActionWorldModelRewardModel,
+    text_model: TextWorldModelRewardModel | None,
     measure: Similarity,
-) -> tuple[Starts, GoalFeatures | None]:  # fmt: skip
+) -> tuple[Starts, GoalFeatures | None]:
     """Tokenise the starts and, with a text model, imagine each one's goal frame once (eq. 6)."""
     device = model.device
     state = torch.from_numpy(frames.state).to(device)
@@ -65,9 +67,11 @@ def load_starts(
             features.append(measure.features(decoded))
     begin = Frames(torch.cat(tokens), state, Context.joined(contexts))
     start_frames = replace(
-        begin, state=state[:, : model.config.state_size], depth=frames.depth(model),
+        begin,
+        state=state[:, : model.config.state_size],
+        depth=frames.depth(model),
         instruction_weights=model.instruction_weights(frames.instructions, len(state)),
-    )  # fmt: skip
+    )
     starts = Starts(start_frames, torch.cat(images), frames.instructions)
     if text_model is None:
         return starts, None
@@ -88,9 +92,12 @@ def joined(parts: Sequence[Features]) -> Features:
 
 @torch.no_grad()
 def imagine_goal_features(
-    model: TextWorldModelRewardModel, frames: Frames, instructions: list[str], features: Features,
+    model: TextWorldModelRewardModel,
+    frames: Frames,
+    instructions: list[str],
+    features: Features,
     measure: Similarity,
-) -> GoalFeatures:  # fmt: skip
+) -> GoalFeatures:
     """Imagine the goal frame of every start.
 
     Args:

@@ -50,9 +50,14 @@ class WorldModelVectorEnv(TensorEnv):
     refuses_nan_first = False
 
     def __init__(
-        self, model: ActionWorldModelRewardModel, starts: Starts, goals: GoalFeatures | None,
-        reward: Reward, config: WorldModelEnv, n_envs: int,
-    ) -> None:  # fmt: skip
+        self,
+        model: ActionWorldModelRewardModel,
+        starts: Starts,
+        goals: GoalFeatures | None,
+        reward: Reward,
+        config: WorldModelEnv,
+        n_envs: int,
+    ) -> None:
         self.model, self.starts, self.goals = model, starts, goals
         self.reward, self.config = reward, config
         self.num_envs, self.max_episode_steps = n_envs, config.horizon
@@ -252,8 +257,11 @@ def warn_of_long_episodes(config: WorldModelEnv, model: ActionWorldModelConfig) 
         logging.warning(
             "imagined episodes of %d frames are longer than the clips of %d frames that the world model has "
             "learnt from, and less reliable from there on: train it with --model.clip_length=%d, or lower "
-            "env.episode_length", config.horizon, model.clip_length, config.horizon,
-        )  # fmt: skip
+            "env.episode_length",
+            config.horizon,
+            model.clip_length,
+            config.horizon,
+        )
 
 
 def make_task_envs(config: WorldModelEnv, n_envs: int, device: str | None) -> dict[int, WorldModelVectorEnv]:

@@ -54,9 +54,11 @@ class EpisodeAccuracy:
 
 @torch.no_grad()
 def measure(
-    model: ActionWorldModelRewardModel, recording: Recording, replay: EpisodeReplay,
+    model: ActionWorldModelRewardModel,
+    recording: Recording,
+    replay: EpisodeReplay,
     lpips: PerceptualDistance | None,
-) -> EpisodeAccuracy:  # fmt: skip
+) -> EpisodeAccuracy:
     """Compare the imagined frames of one episode with the recorded ones."""
     images = recording.images(replay.episode, replay.tokens.device)
     if len(images) < 2:
@@ -81,9 +83,13 @@ def measure(
 
 
 def compare_frames(
-    tokenizer: FrameTokenizer, images: Tensor, imagined_tokens: Tensor, context: Context,
-    lpips: PerceptualDistance | None, horizon: int,
-) -> tuple[dict[str, Tensor], dict[str, float]]:  # fmt: skip
+    tokenizer: FrameTokenizer,
+    images: Tensor,
+    imagined_tokens: Tensor,
+    context: Context,
+    lpips: PerceptualDistance | None,
+    horizon: int,
+) -> tuple[dict[str, Tensor], dict[str, float]]:
     """Compare imagined with recorded frames, and with their reconstruction by the tokenizer, the ceiling.
 
     Args:
@@ -247,9 +253,11 @@ class Robustness:
 
 @torch.no_grad()
 def robustness(
-    model: ActionWorldModelRewardModel, recording: Recording, episodes: np.ndarray,
+    model: ActionWorldModelRewardModel,
+    recording: Recording,
+    episodes: np.ndarray,
     criterion: SuccessCriterion,
-) -> Robustness:  # fmt: skip
+) -> Robustness:
     """Imagine `HORIZON_SECONDS` under each kind of extreme actions, from at most `BATCH` starts.
 
     Frozen actions cannot succeed and ought to leave the image as it is.

@@ -52,10 +52,15 @@ class Pair(NamedTuple):
     def as_json(self) -> dict[str, Any]:
         """Return the pair as JSON. `p_value` decides; `mcnemar_p_value` is valid without early stopping."""
         return {
-            "before": self.before, "after": self.after, "gained": self.change.gained,
-            "lost": self.change.lost, "better": self.better, "p_value": self.p_value,
-            "test": "sequential" if self.sequential else "mcnemar", "mcnemar_p_value": self.change.p_value,
-        }  # fmt: skip
+            "before": self.before,
+            "after": self.after,
+            "gained": self.change.gained,
+            "lost": self.change.lost,
+            "better": self.better,
+            "p_value": self.p_value,
+            "test": "sequential" if self.sequential else "mcnemar",
+            "mcnemar_p_value": self.change.p_value,
+        }
 
 
 @dataclass(frozen=True)

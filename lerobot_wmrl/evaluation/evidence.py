@@ -69,10 +69,12 @@ def replayed_rollouts(env: WorldModelEnv, rollouts: LabelledRollouts) -> Outcome
     for matching, kind in ((outcomes.success, "succeeds"), (~outcomes.success, "fails")):
         if not matching.any():
             raise FieldError(
-                "dataset.root", rollouts.name,
+                "dataset.root",
+                rollouts.name,
                 f"none of the {len(matching)} rollouts {kind} within {env.horizon} frames, so nobody knows "
-                "how often the world model errs", "give rollouts that both succeed and fail",
-            )  # fmt: skip
+                "how often the world model errs",
+                "give rollouts that both succeed and fail",
+            )
     return outcomes
 
 
@@ -123,10 +125,12 @@ def read_references(path: Path | None) -> dict[str, Proportion]:
         kind = (results.get("env") or {}).get("type")
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise FieldError(
-            "references", path, f"no success of policies can be read from it ({first_line(error)})",
+            "references",
+            path,
+            f"no success of policies can be read from it ({first_line(error)})",
             "give comparison.json of lerobot-wmrl-compare, or a file like it: "
             '{"policies": {"outputs/a": {"k": 12, "n": 20}}}',
-        ) from error  # fmt: skip
+        ) from error
     if kind == WorldModelEnv.get_choice_name(WorldModelEnv):
         raise FieldError(
             "references", path, "its episodes are imagined ones", "compare the policies in a real environment"
@@ -137,9 +141,11 @@ def read_references(path: Path | None) -> dict[str, Proportion]:
     if not results.get("complete", not sequential):
         early = "stopped early" if "complete" in results else "may have stopped early"
         raise FieldError(
-            "references", path, f"the comparison {early}, and then the rates lean to the winner",
+            "references",
+            path,
+            f"the comparison {early}, and then the rates lean to the winner",
             "repeat it with --stop_early=false in another folder",
-        )  # fmt: skip
+        )
     return rates
 
 

@@ -81,9 +81,15 @@ def imagine_goals(model: TextWorldModelRewardModel, recording: Recording, episod
         pairs = feature_distances(start.features, finals.features, tokenizer.num_cameras)
         start_distance = least(pairs, same)[0]
     return Goals(
-        episodes, start.images, goal.decoded.images, goal.reached.cpu().numpy(), finals,
-        nearest, distance, start_distance,
-    )  # fmt: skip
+        episodes,
+        start.images,
+        goal.decoded.images,
+        goal.reached.cpu().numpy(),
+        finals,
+        nearest,
+        distance,
+        start_distance,
+    )
 
 
 class GoalQuality(NamedTuple):
@@ -116,9 +122,11 @@ class GoalQuality(NamedTuple):
 def goal_quality(goals: Goals, probe: TrainedProbe | None) -> GoalQuality:
     """Measure the distances of goals and starts to the nearest finals, and the probe's share of successes."""
     quality = GoalQuality(
-        Proportion.of(goals.reached), Estimate.mean(goals.distance),
-        Estimate.mean(goals.start_distance), Estimate.mean(nearest_psnr(goals)),
-    )  # fmt: skip
+        Proportion.of(goals.reached),
+        Estimate.mean(goals.distance),
+        Estimate.mean(goals.start_distance),
+        Estimate.mean(nearest_psnr(goals)),
+    )
     if probe is None or goals.finals is None:
         return quality
     unseen = held_out_from_probe(goals.finals.episodes)

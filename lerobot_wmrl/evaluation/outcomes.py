@@ -103,9 +103,13 @@ class Outcomes:
         if frames is None:
             return self
         return Outcomes(
-            self.episodes, self.probability[:, :frames], self.done[:, :frames], self.held,
-            self.cut | (self.length > frames), frames,
-        )  # fmt: skip
+            self.episodes,
+            self.probability[:, :frames],
+            self.done[:, :frames],
+            self.held,
+            self.cut | (self.length > frames),
+            frames,
+        )
 
     def as_taught(self, table: EpisodeTable) -> "Outcomes":
         """Return the outcomes with success where models learn it, also where that is inferred
@@ -185,10 +189,11 @@ def labelled_recording(model: ActionWorldModelRewardModel, table: EpisodeTable) 
     check_dataset(model.config, table.dataset.meta)
     if not table.has_labels:
         raise FieldError(
-            "dataset.root", table.dataset.root,
+            "dataset.root",
+            table.dataset.root,
             "has neither next.success nor next.done, which say whether success holds",
             "use rollouts with labels",
-        )  # fmt: skip
+        )
     return Recording.read(table, model)
 
 

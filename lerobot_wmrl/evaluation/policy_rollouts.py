@@ -160,7 +160,7 @@ def run_policy(
                 counted = StepCounter(env)
                 results = eval_policy(
                     counted, policy.policy, *processors, n_episodes=episodes, start_seed=seed
-                )["per_episode"]  # fmt: skip
+                )["per_episode"]
                 outcomes |= {(suite, task, each["seed"]): bool(each["success"]) for each in results}
                 steps += counted.steps
     return PolicyEvaluation(outcomes, steps)
@@ -240,16 +240,22 @@ def require_new_starts(envs: Envs, config: EnvConfig, n_episodes: int) -> None:
         return
     if n_episodes > fewest:
         raise FieldError(
-            "n_episodes", n_episodes,
+            "n_episodes",
+            n_episodes,
             f"{problem.format(fewest)} for a task, and an episode that is repeated says nothing new",
             f"set it to at most {fewest}{more}",
-        )  # fmt: skip
+        )
 
 
 def run_comparison(
-    comparison: Comparison, envs: Sequence[Envs], config: EnvConfig, policies: Sequence[LoadedPolicy],
-    batch_size: int, seed: int, save: Callable[[], None],
-) -> None:  # fmt: skip
+    comparison: Comparison,
+    envs: Sequence[Envs],
+    config: EnvConfig,
+    policies: Sequence[LoadedPolicy],
+    batch_size: int,
+    seed: int,
+    save: Callable[[], None],
+) -> None:
     """Add blocks of `batch_size` starts of each task until the comparison is finished.
 
     Args:
@@ -263,10 +269,12 @@ def run_comparison(
     if counts_resets(config) and not comparison.finished:
         if comparison.starts_per_task % batch_size:
             raise FieldError(
-                "n_episodes", comparison.n_episodes,
+                "n_episodes",
+                comparison.n_episodes,
                 f"the {comparison.starts_per_task} starts so far end within a batch of {batch_size}, after "
-                f"which {config.type} skips some", "choose a new `output_dir`",
-            )  # fmt: skip
+                f"which {config.type} skips some",
+                "choose a new `output_dir`",
+            )
         for env in (each for policy_envs in envs for each in flat(policy_envs)):
             for _ in range(ceil(comparison.starts_per_task / batch_size)):
                 env.reset(options={NEW_ROLLOUT_OPTION: True})

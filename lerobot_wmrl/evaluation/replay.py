@@ -86,9 +86,12 @@ class Recording:
         state = torch.from_numpy(self.table.state[rows]).to(tokens.device)
         instructions = [self.table.instructions[episode] for episode in episodes]
         return Frames(
-            tokens, state, context, model.recorded_depth(self.table.dataset, rows),
+            tokens,
+            state,
+            context,
+            model.recorded_depth(self.table.dataset, rows),
             model.instruction_weights(instructions, len(episodes)),
-        )  # fmt: skip
+        )
 
     def actions(self, episodes: np.ndarray, steps: int, device: torch.device) -> Tensor:
         """Return the first `steps` actions of E episodes; short episodes repeat their last. (E, steps, A)"""
@@ -194,13 +197,17 @@ def _replay_batch(
         rows, shown = recording.rows(episode), recording.compared_rows(episode)
         steps = slice(0, shown.stop - shown.start)
         yield EpisodeReplay(
-            episode, frames.context[[row]], imagined.tokens[row, steps],
-            probability[row, : rows.stop - rows.start], imagined.state[row, steps],
-            shuffled[row] if comparable[row] else None, table.done[rows],
+            episode,
+            frames.context[[row]],
+            imagined.tokens[row, steps],
+            probability[row, : rows.stop - rows.start],
+            imagined.state[row, steps],
+            shuffled[row] if comparable[row] else None,
+            table.done[rows],
             recorded_and_imagined_depth(
                 model, recording, shown, None if imagined.depth is None else imagined.depth[row, steps]
             ),
-        )  # fmt: skip
+        )
 
 
 def recorded_and_imagined_depth(

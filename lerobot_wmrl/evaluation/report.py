@@ -117,9 +117,11 @@ class Report(NamedTuple):
 
 
 def evaluate(
-    model: ActionWorldModelRewardModel, recording: Recording, episodes: np.ndarray,
+    model: ActionWorldModelRewardModel,
+    recording: Recording,
+    episodes: np.ndarray,
     episode_length: int | None = None,
-) -> ReplayEvaluation:  # fmt: skip
+) -> ReplayEvaluation:
     """Replay and measure the episodes, keeping the measures and only two replays' frames.
 
     Args:
@@ -133,10 +135,11 @@ def evaluate(
     """
     if recording.table.length[episodes].max() < 2:
         raise FieldError(
-            "dataset.root", recording.table.dataset.root,
+            "dataset.root",
+            recording.table.dataset.root,
             "every chosen episode has a single frame: there is nothing to predict",
             "use a dataset with longer episodes",
-        )  # fmt: skip
+        )
     lpips = cached_lpips(model.device)
     accuracy, replays = [], []
     shown: dict[str, EpisodeReplay] = {}
@@ -152,16 +155,18 @@ def evaluate(
 
 
 def report_action_model(
-    model: ActionWorldModelRewardModel, recording: Recording, evaluation: ReplayEvaluation,
-    criterion: SuccessCriterion, folder: Path,
-) -> Report:  # fmt: skip
+    model: ActionWorldModelRewardModel,
+    recording: Recording,
+    evaluation: ReplayEvaluation,
+    criterion: SuccessCriterion,
+    folder: Path,
+) -> Report:
     """Report accuracy, done, gate and robustness, and save their pictures in `folder`."""
     outcomes, horizon = evaluation.outcomes, recording.steps(HORIZON_SECONDS)
     taught = outcomes.as_taught(recording.table)
     estimates = headline(evaluation.accuracy, horizon) | done_accuracy(taught, criterion)
-    play = [
-        e for e in evaluation.accuracy if recording.table.column(START_KIND)[e.episode] == KINDS.index(PLAY)
-    ]
+    kinds = recording.table.column(START_KIND)
+    play = [each for each in evaluation.accuracy if kinds[each.episode] == KINDS.index(PLAY)]
     steps, play_steps = by_step(evaluation.accuracy, horizon), by_step(play, COMPARED_FRAMES)
     gate, gates, tasks = gate_at(outcomes, criterion), sweep(outcomes), by_task(outcomes, recording.table)
     at_task = {task: gate_at(task_outcomes, criterion) for task, task_outcomes in tasks.items()}
@@ -180,9 +185,7 @@ def report_action_model(
         "operating_point": best.as_json() if best else None,
         "seen_auc": None if math.isnan(seen_auc) else seen_auc,
         "gate_by_task": {task: gate.as_json() for task, gate in at_task.items()},
-        "operating_point_by_task": {
-            task: point.as_json() if point else None for task, point in best_at_task.items()
-        },
+        "operating_point_by_task": {task: point and point.as_json() for task, point in best_at_task.items()},
         "gate_sweep": [gate.as_json() for gate in gates],
         "extreme_actions": extremes.as_json(),
     }
@@ -275,12 +278,15 @@ def task_table(gates: Mapping[str, Gate], best: Mapping[str, Gate | None]) -> st
     """
     rows = [
         (
-            task, gate.false_positives, gate.recall,
-            "–" if math.isnan(gate.auc) else f"{gate.auc:.2f}", "yes" if gate.passed else "no",
+            task,
+            gate.false_positives,
+            gate.recall,
+            "–" if math.isnan(gate.auc) else f"{gate.auc:.2f}",
+            "yes" if gate.passed else "no",
             "–" if not gate.recall.n or not gate.false_positives.n else _best(best[task]),
         )
         for task, gate in gates.items()
-    ]  # fmt: skip
+    ]
     column = "threshold, frames: recall with at most 5 % false positives"
     table = markdown_table(("task", "false positives", "recall", "AUC", "passed", column), rows)
     blind = [task for task, gate in gates.items() if gate.recall.n and not gate.recall.k]

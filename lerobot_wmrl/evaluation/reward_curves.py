@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from lerobot_wmrl.common.images import to_pixels
 from lerobot_wmrl.common.success_criterion import SuccessCriterion
@@ -18,9 +19,14 @@ from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardM
 
 @torch.no_grad()
 def reward_along_episode(
-    text_model: TextWorldModelRewardModel, reward: GeneralConfig, recording: Recording,
-    replay: EpisodeReplay, *, criterion: SuccessCriterion, longest: int,
-) -> dict[str, Any]:  # fmt: skip
+    text_model: TextWorldModelRewardModel,
+    reward: GeneralConfig,
+    recording: Recording,
+    replay: EpisodeReplay,
+    *,
+    criterion: SuccessCriterion,
+    longest: int,
+) -> dict[str, Any]:
     """Compute eqs. 5-8 for an episode: the similarity of recorded frames, and the success of imagined ones.
 
     Args:
@@ -43,14 +49,14 @@ def reward_along_episode(
     goal_features = select_features(measure.features(goal.decoded), every, cameras)
     similarity = measure(measure.features(decoded), goal_features, cameras)
     probability = replay.done_probability[:-1]
-    (begin,) = criterion.first_met(probability.cpu().numpy()[None])
-    paid = torch.zeros_like(similarity[1:])
-    if begin >= 0:
-        paid[begin + criterion.frames - 1] = 1
     earned = general_reward(
-        paid, similarity[1:], similarity[:-1],
-        alpha=reward.alpha, form=reward.form, gamma=potential_discount(reward, longest),
-    )  # fmt: skip
+        paid_once(probability, criterion),
+        similarity[1:],
+        similarity[:-1],
+        alpha=reward.alpha,
+        form=reward.form,
+        gamma=potential_discount(reward, longest),
+    )
     return {
         "done_probability": probability.tolist(),
         "similarity": similarity[1:].tolist(),
@@ -59,3 +65,13 @@ def reward_along_episode(
         "goal_frame": to_pixels(goal.decoded.images[0]),
         "final_frame": np.asarray(recording.frames[rows][-1]),
     }
+
+
+def paid_once(probability: Tensor, criterion: SuccessCriterion) -> Tensor:
+    """Return 1 for the frame at which an episode has met the criterion, 0 for the others but the first,
+    which is none of an action. (T,) → (T - 1,)"""
+    paid = torch.zeros_like(probability[1:])
+    (begin,) = criterion.first_met(probability.cpu().numpy()[None])
+    if begin >= 0:
+        paid[begin + criterion.frames - 1] = 1
+    return paid

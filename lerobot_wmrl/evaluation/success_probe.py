@@ -37,12 +37,18 @@ class SuccessProbe(nn.Module):
     def __init__(self, num_cameras: int) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Conv2d(6 * num_cameras, 32, 5, stride=2, padding=2), nn.ReLU(),
-            nn.Conv2d(32, 48, 3, stride=2, padding=1), nn.ReLU(),
-            nn.Conv2d(48, 64, 3, stride=2, padding=1), nn.ReLU(),
-            nn.Flatten(), nn.Dropout(0.2), nn.Linear(64 * (PROBE_SIZE // 8) ** 2, 64), nn.ReLU(),
+            nn.Conv2d(6 * num_cameras, 32, 5, stride=2, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(32, 48, 3, stride=2, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(48, 64, 3, stride=2, padding=1),
+            nn.ReLU(),
+            nn.Flatten(),
+            nn.Dropout(0.2),
+            nn.Linear(64 * (PROBE_SIZE // 8) ** 2, 64),
+            nn.ReLU(),
             nn.Linear(64, 1),
-        )  # fmt: skip
+        )
 
     def forward(self, first: Tensor, images: Tensor) -> Tensor:
         return self.layers(torch.cat([_small(first), _small(images)], 1) - 0.5)[:, 0]

@@ -120,10 +120,11 @@ class ImproveConfig(RunConfig):
             )
         if self.rollouts and isinstance(self.real_env, WmrlManiSkillEnv) and self.real_env.split == "ood":
             raise FieldError(
-                "real_env.split", "ood",
+                "real_env.split",
+                "ood",
                 "results are reported on unseen scenes: nothing may be learnt in them",
                 "choose ind, or leave `rollouts` out",
-            )  # fmt: skip
+            )
         if self.max_frames is not None:
             self._check_max_frames()
         last = EVALUATION_SEED - (self.rollouts + ROLLOUT_SEED_OFFSET if self.rollouts else 1)

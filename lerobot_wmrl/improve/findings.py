@@ -93,22 +93,27 @@ def require_mergeable(dataset: LeRobotDataset, env: WmrlManiSkillEnv) -> None:
     colours = [name for name, feature in features.items() if shows_colours(feature)]
     if lacking := [name for name in (*START_COLUMNS, "next.truncated") if name not in features]:
         raise FieldError(
-            "dataset.root", dataset.root,
+            "dataset.root",
+            dataset.root,
             f"lacks {', '.join(lacking)}, which rollouts in ManiSkill have: they could not be merged",
             "record it with lerobot-wmrl-record, or leave `rollouts` out",
-        )  # fmt: skip
+        )
     if {*colours} != {*shown}:
         raise FieldError(
-            "real_env.cameras", list(env.cameras),
+            "real_env.cameras",
+            list(env.cameras),
             f"rollouts would have these, the dataset has {', '.join(camera_names(colours))}: they could not "
-            "be merged", f"set `real_env.cameras` to [{','.join(camera_names(colours))}]",
-        )  # fmt: skip
+            "be merged",
+            f"set `real_env.cameras` to [{','.join(camera_names(colours))}]",
+        )
     if depth := dataset.meta.depth_keys:
         raise FieldError(
-            "dataset.root", dataset.root, f"has {', '.join(depth)}, which the rollouts lack",
+            "dataset.root",
+            dataset.root,
+            f"has {', '.join(depth)}, which the rollouts lack",
             "remove these columns: "
             + edit_advice(dataset.root, "remove_feature", {"operation.feature_names": [*depth]}),
-        )  # fmt: skip
+        )
 
 
 def require_improvable(
@@ -120,16 +125,20 @@ def require_improvable(
     """
     if not any(key.startswith(OBS_IMAGE) for key in policy.image_features):
         raise FieldError(
-            "policy.path", policy.pretrained_path, "looks at no camera, and a world model imagines frames",
+            "policy.path",
+            policy.pretrained_path,
+            "looks at no camera, and a world model imagines frames",
             "train a policy that looks at one",
-        )  # fmt: skip
+        )
     check_fit(policy, shown, table.action.shape[1], "the dataset")
     if not table.success.any():
         has = "has no successful episode" if table.has_labels else "says nowhere whether an episode succeeds"
         raise FieldError(
-            "dataset.root", table.dataset.root, f"{has}, so there is nothing to reward",
+            "dataset.root",
+            table.dataset.root,
+            f"{has}, so there is nothing to reward",
             "add next.success with lerobot-wmrl-label, or record successes",
-        )  # fmt: skip
+        )
     require_shown(table, range(len(table.start)))
 
 
@@ -151,34 +160,51 @@ def inspect_dataset(
     sizes = {key: frame_size(features[key]) for key in keys if key in features}
     state = {OBS_STATE: tuple(features[OBS_STATE]["shape"])} if OBS_STATE in features else {}
     require_improvable(table, policy, {key: (3, *size) for key, size in sizes.items()} | state)
-    seconds, fps = table.length / table.dataset.fps, table.dataset.fps
-    cameras = [f"{name} {h}x{w}" for name, (h, w) in zip(camera_names(keys), sizes.values(), strict=True)]
-    lines = [
-        f"{len(success)} episodes, {table.length.sum()} frames at {fps} Hz; the longest has "
-        f"{table.length.max()} ({seconds.max():.1f} s)",
-        f"cameras that the policy sees (height x width): {', '.join(cameras)}",
-        f"action: {', '.join(component_names(features[ACTION]))}",
-        f"state: {', '.join(component_names(features[OBS_STATE])) if state else 'none'}",
-        f"{success.sum()} episodes succeed, {(~success).sum()} fail",
-    ]
     tasks = np.unique(table.column(START_TASK), return_counts=True)[1]
     done = [table.success_target[rows].sum() for rows in table.rows(range(len(success)))]
     return Findings(
-        lines=lines,
+        lines=describe(table, dict(zip(camera_names(keys), sizes.values(), strict=True))),
         missing=[
-            *missing_labels(table), *([] if rollouts else [*one_sided_tasks(table), *few_failures(table)]),
+            *missing_labels(table),
+            *([] if rollouts else [*one_sided_tasks(table), *few_failures(table)]),
             *few_decisions(policy, table),
         ],
         cameras=camera_names(keys),
-        frame_side=min(map(min, sizes.values())), pixels=sum(h * w for h, w in sizes.values()),
-        held_out=len(held_out), held_out_tell=tell_apart(held_out),
-        tasks=len(tasks), fewest=int(tasks.min()), longest=int(table.length.max()),
+        frame_side=min(map(min, sizes.values())),
+        pixels=sum(h * w for h, w in sizes.values()),
+        held_out=len(held_out),
+        held_out_tell=tell_apart(held_out),
+        tasks=len(tasks),
+        fewest=int(tasks.min()),
+        longest=int(table.length.max()),
         usual=usual_length(table),
-        success_frames=int(table.length[success].sum()), failures=int((~success).sum()),
-        root=Path(table.dataset.root), total=total,
+        success_frames=int(table.length[success].sum()),
+        failures=int((~success).sum()),
+        root=Path(table.dataset.root),
+        total=total,
         columns={name: feature["dtype"] for name, feature in features.items()},
         held=int(np.median(np.array(done)[success])),
-    )  # fmt: skip
+    )
+
+
+def describe(table: EpisodeTable, sizes: Mapping[str, tuple[int, int]]) -> list[str]:
+    """Describe a dataset in a few lines; sizes: camera → height and width of its frames."""
+    features, success, fps, longest = (
+        table.dataset.features,
+        table.success,
+        table.dataset.fps,
+        table.length.max(),
+    )
+    state = component_names(features[OBS_STATE]) if OBS_STATE in features else ["none"]
+    cameras = [f"{name} {height}x{width}" for name, (height, width) in sizes.items()]
+    return [
+        f"{len(success)} episodes, {table.length.sum()} frames at {fps} Hz; the longest has {longest} "
+        f"({longest / fps:.1f} s)",
+        f"cameras that the policy sees (height x width): {', '.join(cameras)}",
+        f"action: {', '.join(component_names(features[ACTION]))}",
+        f"state: {', '.join(state)}",
+        f"{success.sum()} episodes succeed, {(~success).sum()} fail",
+    ]
 
 
 def usual_length(table: EpisodeTable) -> int:

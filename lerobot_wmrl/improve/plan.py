@@ -30,9 +30,10 @@ from lerobot_wmrl.maniskill.recordings import require_unreported
 from lerobot_wmrl.rewards.general import default_discount
 
 DURATIONS: Final = {
-    "tiny": "about a minute on two cores", "demo": "about an hour on two cores",
+    "tiny": "about a minute on two cores",
+    "demo": "about an hour on two cores",
     "cpu": "several hours on two cores, not measured with an accelerator",
-}  # fmt: skip
+}
 """How long all stages but those in `real_env` take."""
 
 SLOWEST: Final = 2
@@ -83,9 +84,13 @@ class Plan:
             require_mergeable(table.dataset, config.real_env)
         robot = read_embodiment(table.dataset.meta, Embodiment())
         check_units(
-            policy, postprocessor, robot.action_names,
-            torch.tensor(robot.action_low), torch.tensor(robot.action_high), "the dataset",
-        )  # fmt: skip
+            policy,
+            postprocessor,
+            robot.action_names,
+            torch.tensor(robot.action_low),
+            torch.tensor(robot.action_high),
+            "the dataset",
+        )
         if config.real_env is not None:
             starts = max(config.eval_episodes, config.selection_episodes)
             # not in this process: stages are forks of it that render too

@@ -166,10 +166,16 @@ def stalk_mesh(spec: ObjectSpec) -> trimesh.Trimesh:
 def container_mesh(spec: ContainerSpec) -> trimesh.Trimesh:
     """Return a bowl or plate with its rim. Its underside is at z = 0."""
     radius, height = spec.radius, spec.height
-    outline = np.array([
-        (0.0, 0.0), (FLOOR_SHARE * radius, 0.0), (radius, height), (radius - BOWL_WALL, height),
-        (FLOOR_SHARE * radius - 0.5 * BOWL_WALL, BOWL_WALL), (0.0, BOWL_WALL),
-    ])  # fmt: skip
+    outline = np.array(
+        [
+            (0.0, 0.0),
+            (FLOOR_SHARE * radius, 0.0),
+            (radius, height),
+            (radius - BOWL_WALL, height),
+            (FLOOR_SHARE * radius - 0.5 * BOWL_WALL, BOWL_WALL),
+            (0.0, BOWL_WALL),
+        ]
+    )
     return trimesh.creation.revolve(outline, sections=MESH_SECTIONS)
 
 

@@ -186,10 +186,11 @@ class BatchedSimulation:
         quaternion = torch.where(poses[:, 4:5] < 0, -poses[:, 3:], poses[:, 3:])
         state = torch.cat([poses[:, :3], quaternion, opening[:, None]], 1).float()
         return BatchedFrame(
-            self._images(), state,
+            self._images(),
+            state,
             torch.tensor(reward, dtype=torch.float32, device=self.device),
             torch.tensor(success, device=self.device),
-        )  # fmt: skip
+        )
 
     def _situations(self, tcp: Tensor, opening: Tensor) -> list[Situation]:
         """Return what the task judges, row by row, for tcp (B, 3) and opening (B,)."""

@@ -56,7 +56,12 @@ class RunningEpisode:
     def situation(self, position: np.ndarray, tcp: np.ndarray, opening: float) -> Situation:
         """Return what the task judges when the object is at `position` (3,), the TCP at `tcp` (3,)."""
         return Situation(
-            self.start, self.scene.object_spec, self.scene.container_spec,
-            self.object_start, position, tcp, opening,
+            self.start,
+            self.scene.object_spec,
+            self.scene.container_spec,
+            self.object_start,
+            position,
+            tcp,
+            opening,
             float(np.linalg.norm(position - self.object_before)) * FPS,
-        )  # fmt: skip
+        )

@@ -100,27 +100,55 @@ OBJECTS: Final[Mapping[str, ObjectSpec]] = {
         ObjectSpec("lemon", "ellipsoid", (0.034, 0.026, 0.026), (0.98, 0.88, 0.20), "lemon"),
         ObjectSpec("peach", "ellipsoid", (0.032, 0.032, 0.030), (0.98, 0.58, 0.42), "peach"),
         ObjectSpec(
-            "bell_pepper", "revolved", (0.031, 0.031, 0.034), (0.08, 0.42, 0.06), "green bell pepper",
-            profile=PEPPER, lobes=4, stalk=(0.35, 0.30, 0.08),
+            "bell_pepper",
+            "revolved",
+            (0.031, 0.031, 0.034),
+            (0.08, 0.42, 0.06),
+            "green bell pepper",
+            profile=PEPPER,
+            lobes=4,
+            stalk=(0.35, 0.30, 0.08),
         ),
         ObjectSpec("garlic", "revolved", (0.028, 0.028, 0.030), (0.95, 0.92, 0.86), "garlic", profile=GARLIC),
         ObjectSpec(
-            "carrot", "revolved", (0.042, 0.019, 0.019), (0.95, 0.38, 0.03), "carrot",
-            profile=CARROT, lies=True, stalk=GREEN,
+            "carrot",
+            "revolved",
+            (0.042, 0.019, 0.019),
+            (0.95, 0.38, 0.03),
+            "carrot",
+            profile=CARROT,
+            lies=True,
+            stalk=GREEN,
         ),
         ObjectSpec("tomato", "ellipsoid", (0.033, 0.033, 0.028), (0.85, 0.05, 0.03), "tomato", stalk=GREEN),
         ObjectSpec(
-            "pear", "revolved", (0.029, 0.029, 0.040), (0.72, 0.75, 0.18), "pear",
-            profile=PEAR, stalk=(0.30, 0.18, 0.08),
+            "pear",
+            "revolved",
+            (0.029, 0.029, 0.040),
+            (0.72, 0.75, 0.18),
+            "pear",
+            profile=PEAR,
+            stalk=(0.30, 0.18, 0.08),
         ),
         ObjectSpec(
-            "aubergine", "revolved", (0.044, 0.025, 0.025), (0.22, 0.05, 0.28), "aubergine",
-            profile=AUBERGINE, lies=True, stalk=GREEN,
+            "aubergine",
+            "revolved",
+            (0.044, 0.025, 0.025),
+            (0.22, 0.05, 0.28),
+            "aubergine",
+            profile=AUBERGINE,
+            lies=True,
+            stalk=GREEN,
         ),
         ObjectSpec("potato", "ellipsoid", (0.037, 0.028, 0.025), (0.58, 0.42, 0.22), "potato"),
         ObjectSpec(
-            "apple", "revolved", (0.033, 0.033, 0.031), (0.62, 0.04, 0.10), "red apple",
-            profile=APPLE, stalk=(0.25, 0.15, 0.06),
+            "apple",
+            "revolved",
+            (0.033, 0.033, 0.031),
+            (0.62, 0.04, 0.10),
+            "red apple",
+            profile=APPLE,
+            stalk=(0.25, 0.15, 0.06),
         ),
         ObjectSpec("orange", "ellipsoid", (0.033, 0.033, 0.033), (0.98, 0.48, 0.02), "orange"),
         ObjectSpec("soap", "box", (0.032, 0.024, 0.016), (0.95, 0.62, 0.72), "pink soap"),
@@ -129,7 +157,7 @@ OBJECTS: Final[Mapping[str, ObjectSpec]] = {
         ObjectSpec("wooden_block", "box", (0.026, 0.020, 0.026), (0.76, 0.58, 0.36), "wooden block"),
         ObjectSpec("glue_stick", "cylinder", (0.018, 0.018, 0.036), (0.45, 0.12, 0.62), "purple glue stick"),
     )
-}  # fmt: skip
+}
 """Twenty objects that differ in shape, size and colour, each narrow enough for the gripper (8 cm)."""
 
 CONTAINERS: Final = {
@@ -183,9 +211,12 @@ def describe_assets(path: Path) -> dict[str, dict[str, Any]]:
     for name, spec in read_assets(path).items():
         assert spec.mesh is not None
         described[name] = {
-            "label": spec.label, "density": spec.density, "half_size": [round(x, 6) for x in spec.half_size],
-            "scale": spec.mesh.scale, "sha256": hashlib.sha256(Path(spec.mesh.path).read_bytes()).hexdigest(),
-        }  # fmt: skip
+            "label": spec.label,
+            "density": spec.density,
+            "half_size": [round(x, 6) for x in spec.half_size],
+            "scale": spec.mesh.scale,
+            "sha256": hashlib.sha256(Path(spec.mesh.path).read_bytes()).hexdigest(),
+        }
     return described
 
 
@@ -208,10 +239,13 @@ def _specification(path: Path, name: str, entry: dict[str, Any]) -> ObjectSpec:
     _check_size(path, name, half_size, scale)
     centre = (low + high) / 2
     return replace(
-        OBJECTS[name], shape="mesh", half_size=tuple(half_size.tolist()),
+        OBJECTS[name],
+        shape="mesh",
+        half_size=tuple(half_size.tolist()),
         mesh=MeshFile(str(file.resolve()), scale, tuple(centre.tolist())),
-        label=str(entry.get("label", OBJECTS[name].label)), density=density,
-    )  # fmt: skip
+        label=str(entry.get("label", OBJECTS[name].label)),
+        density=density,
+    )
 
 
 def _positive(path: Path, name: str, entry: dict[str, Any], key: str, default: float) -> float:

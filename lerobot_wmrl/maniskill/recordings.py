@@ -25,10 +25,11 @@ def scene_splits(scene: np.ndarray, split: str) -> dict[str, np.ndarray]:
     asked = {"ind", "ood"} & {*split.split(",")}
     if asked and (scene < 0).all():
         raise FieldError(
-            "split", split,
+            "split",
+            split,
             "the dataset does not say which scenes its episodes are in (no column start.scene)",
             "choose all, train or validation",
-        )  # fmt: skip
+        )
     held_out = np.isin(scene, [each.index for each in scenes_of("ood")])
     return {"ind": (scene >= 0) & ~held_out, "ood": (scene >= 0) & held_out}
 
@@ -43,11 +44,12 @@ def require_unmeasured(table: EpisodeTable) -> None:
     measured = (seeds >= EVALUATION_SEED) & (seeds < SELECTION_SEED)
     if measured.any():
         raise FieldError(
-            "dataset.root", table.dataset.root,
+            "dataset.root",
+            table.dataset.root,
             f"{measured.sum()} of {len(seeds)} episodes have evaluation seeds, on which results are "
             f"reported; the first is episode {np.argmax(measured)} (seed {seeds[measured][0]})",
             f"choose the policy on others, recorded with seeds from {SELECTION_SEED} on",
-        )  # fmt: skip
+        )
 
 
 def require_unreported(table: EpisodeTable, episodes: np.ndarray, remedy: str) -> None:
@@ -66,8 +68,9 @@ def require_unreported(table: EpisodeTable, episodes: np.ndarray, remedy: str) -
     if reported.any():
         first = int(np.argmax(reported))
         raise FieldError(
-            "dataset.root", table.dataset.root,
+            "dataset.root",
+            table.dataset.root,
             f"{reported.sum()} of {len(episodes)} episodes to learn from have evaluation seeds or unseen "
             f"scenes, the first is episode {episodes[first]} (seed {seed[first]}, scene {scene[first]})",
             f"{remedy}, or record with seeds below {EVALUATION_SEED} in known scenes",
-        )  # fmt: skip
+        )

@@ -33,9 +33,13 @@ def camera_config(name: str, image_size: int, robot: Any) -> CameraConfig:
         robot: ManiSkill's articulation, on whose hand the wrist camera is mounted.
     """
     frame = {
-        "uid": name, "width": image_size, "height": image_size, "near": NEAR, "far": FAR,
+        "uid": name,
+        "width": image_size,
+        "height": image_size,
+        "near": NEAR,
+        "far": FAR,
         "shader_config": sensor_shaders(),
-    }  # fmt: skip
+    }
     if name in VIEWS:
         view = VIEWS[name]
         return CameraConfig(pose=sapien_utils.look_at(view.eye, view.target), fov=view.fov, **frame)

@@ -69,9 +69,14 @@ class TabletopEnv(BaseEnv):
     ) -> None:
         self.scenes, self.rendering = {scene.index: scene for scene in scenes}, rendering
         super().__init__(
-            num_envs=num_envs, obs_mode="none", reward_mode="none", control_mode=CONTROL_MODE,
-            robot_uids=BaseAxesPanda.uid, sim_backend=sim_backend, **kwargs,
-        )  # fmt: skip
+            num_envs=num_envs,
+            obs_mode="none",
+            reward_mode="none",
+            control_mode=CONTROL_MODE,
+            robot_uids=BaseAxesPanda.uid,
+            sim_backend=sim_backend,
+            **kwargs,
+        )
 
     @property
     def _default_sim_config(self) -> SimConfig:

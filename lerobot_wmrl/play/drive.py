@@ -84,9 +84,13 @@ class Drive:
     """
 
     def __init__(
-        self, start: StartImages, models: WorldModels, config: WorldModelEnv,
-        recorded: Recorded | None = None, real: RealEpisode | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        start: StartImages,
+        models: WorldModels,
+        config: WorldModelEnv,
+        recorded: Recorded | None = None,
+        real: RealEpisode | None = None,
+    ) -> None:
         self.models, self.recorded, self.real = models, recorded, real
         self.env: WorldModelVectorEnv = make_env_at(start, models, config, 1)
         self.instruction = start.instructions[0]
@@ -114,9 +118,10 @@ class Drive:
         self.require_running()
         if tuple(action.shape) != self.env.action_space.shape or not bool(action.isfinite().all()):
             raise FieldError(
-                "action", action.flatten().tolist(),
+                "action",
+                action.flatten().tolist(),
                 f"must be {self.env.single_action_space.shape[0]} finite numbers",
-            )  # fmt: skip
+            )
         self.synchronized = False
         self._advance(action)
         if self.real is not None:

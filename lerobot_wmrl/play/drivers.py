@@ -70,9 +70,15 @@ class PlannerDriver:
         """Return planned actions. (1, T, A)"""
         env = drive.env
         self.planner = self.planner or Planner(
-            env.model, None, self.settings, min(self.done_frames, self.settings.horizon),
-            averaged=False, low=env.action_low, high=env.action_high, seed=PLANNER_SEED,
-        )  # fmt: skip
+            env.model,
+            None,
+            self.settings,
+            min(self.done_frames, self.settings.horizon),
+            averaged=False,
+            low=env.action_low,
+            high=env.action_high,
+            seed=PLANNER_SEED,
+        )
         proposed = None
         if self.policy is not None:
             self.policy.reset()

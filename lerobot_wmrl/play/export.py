@@ -123,15 +123,20 @@ def describe(world: World, table: EpisodeTable, rows: np.ndarray) -> dict[str, A
     served = world.description()
     return {
         **served,
-        "drivers": ["recorded"], "policy": "", "real": "", "goal": False, "compares": False,
-        "first_frames": True, "saves": False,
+        "drivers": ["recorded"],
+        "policy": "",
+        "real": "",
+        "goal": False,
+        "compares": False,
+        "first_frames": True,
+        "saves": False,
         "side": world.tokenizer_config.image_size,
         "sizes": [[width, height] for _, height, width in world.tokenizer_config.frame_shapes.values()],
         "window": world.model.clip_length,
         "done_frames": world.config.done_frames,
         "episode_length": world.config.horizon,
         "episodes": [{**served["episodes"][row], **recorded(world, table, row)} for row in rows.tolist()],
-    }  # fmt: skip
+    }
 
 
 def recorded(world: World, table: EpisodeTable, row: int) -> Mapping[str, Any]:
@@ -167,6 +172,8 @@ def fetch_runtime(folder: Path) -> None:
         except (OSError, subprocess.SubprocessError, tarfile.TarError, StopIteration, KeyError) as error:
             reason = getattr(error, "stderr", None) or error
             raise FieldError(
-                "export", RUNTIME, f"npm cannot fetch it ({str(reason).strip()})",
+                "export",
+                RUNTIME,
+                f"npm cannot fetch it ({str(reason).strip()})",
                 "install npm, and let it reach a registry",
-            ) from error  # fmt: skip
+            ) from error

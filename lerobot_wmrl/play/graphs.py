@@ -219,10 +219,11 @@ def export_graphs(model: ActionWorldModelRewardModel, folder: Path) -> None:
     kind = model.config.dynamics.type
     if kind != "anchored":
         raise FieldError(
-            "world_model.path", model.config.pretrained_path,
+            "world_model.path",
+            model.config.pretrained_path,
             f"has {kind} dynamics; only anchored ones can be exported",
             "train one with --model.dynamics.type=anchored, or serve the page instead",
-        )  # fmt: skip
+        )
     tokenizer_config = model.config.tokenizer
     tensors: Tensors = {
         "pictures": torch.rand(
@@ -242,9 +243,13 @@ def export_graphs(model: ActionWorldModelRewardModel, folder: Path) -> None:
         with torch.no_grad(), warnings.catch_warnings(action="ignore"):  # of torch's, about torch's own code
             outputs = graph.eval().compute(inputs)
             program = torch.onnx.export(
-                graph, tuple(inputs.values()), input_names=list(inputs), output_names=list(outputs),
-                dynamo=True, verbose=False,
-            )  # fmt: skip
+                graph,
+                tuple(inputs.values()),
+                input_names=list(inputs),
+                output_names=list(outputs),
+                dynamo=True,
+                verbose=False,
+            )
         assert program is not None
         (folder / f"{name}.onnx").write_bytes(in_float16(program.model_proto).SerializeToString())
         tensors |= input_names(outputs)
@@ -256,9 +261,10 @@ def in_float16(proto: "onnx.ModelProto") -> "onnx.ModelProto":
 
     graph = proto.graph
     large = [
-        each for each in graph.initializer
+        each
+        for each in graph.initializer
         if each.data_type == TensorProto.FLOAT and np.prod(each.dims) >= LARGE
-    ]  # fmt: skip
+    ]
     for index, weights in enumerate(large):
         name = f"{weights.name}_half"
         half = numpy_helper.to_array(weights).astype(np.float16)
@@ -285,8 +291,10 @@ class ExportedWorldModel:
     def begin(self, pictures: np.ndarray, state: np.ndarray, instruction: str) -> None:
         """Begin in pictures (1, N, 3, S, S), in [0, 1], and a state (1, P)."""
         self.tensors: dict[str, np.ndarray] = {
-            "pictures": pictures, "measured_state": state, BYTES: instruction_bytes(instruction),
-        }  # fmt: skip
+            "pictures": pictures,
+            "measured_state": state,
+            BYTES: instruction_bytes(instruction),
+        }
         self.imagined = 0
         self._run("start")
 

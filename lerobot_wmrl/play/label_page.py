@@ -67,9 +67,12 @@ class LabelPage:
     def application(self) -> web.Application:
         """Return the web application."""
         return self.access.application(
-            "label.html", web.get("/dataset", self._describe), web.get("/frame", self._frame),
-            web.post("/label", self._label), web.post("/finish", self._finish),
-        )  # fmt: skip
+            "label.html",
+            web.get("/dataset", self._describe),
+            web.get("/frame", self._frame),
+            web.post("/label", self._label),
+            web.post("/finish", self._finish),
+        )
 
     def label(self, episode: Any, first: Any) -> None:
         """Label an episode, and write the file.
@@ -96,10 +99,14 @@ class LabelPage:
         tasks = [", ".join(row["tasks"]) for row in self.dataset.meta.episodes]
         return web.json_response(
             {
-                "fps": self.dataset.fps, "cameras": self.cameras,
-                "lengths": self.lengths, "tasks": tasks, "labels": self.labels, "last": self.last,
+                "fps": self.dataset.fps,
+                "cameras": self.cameras,
+                "lengths": self.lengths,
+                "tasks": tasks,
+                "labels": self.labels,
+                "last": self.last,
             }
-        )  # fmt: skip
+        )
 
     async def _frame(self, request: web.Request) -> web.Response:
         camera = request.query.get("camera", "")
@@ -151,18 +158,22 @@ class LabelPage:
             raise FieldError("file", self.file, "holds no labels", "choose another file") from error
         if not same:
             raise FieldError(
-                "file", self.file, f"holds the labels of {stored.get('dataset')} with other episodes",
+                "file",
+                self.file,
+                f"holds the labels of {stored.get('dataset')} with other episodes",
                 "choose another file",
-            )  # fmt: skip
+            )
         labels: Labels = {}
         for episode, first in given.items():
             try:
                 labels |= self._checked(episode, first)
             except FieldError as error:
                 raise FieldError(
-                    "file", self.file, f"the label {episode}: {json.dumps(first)} cannot be ({error})",
+                    "file",
+                    self.file,
+                    f"the label {episode}: {json.dumps(first)} cannot be ({error})",
                     "correct it there, or take it out",
-                ) from error  # fmt: skip
+                ) from error
         return labels
 
 

@@ -66,10 +66,13 @@ class SavedEpisodes:
             features = features or episode_features(step.before, self.robot, "image")
             solved = success and index >= count - self.held
             frame: dict[str, Any] = {
-                **observation_row(step.before, 0), ACTION: step.action, "task": instruction,
+                **observation_row(step.before, 0),
+                ACTION: step.action,
+                "task": instruction,
                 "next.reward": np.array([step.reward], np.float32),
-                "next.success": np.array([solved]), "next.done": np.array([index == count - 1]),
-            }  # fmt: skip
+                "next.success": np.array([solved]),
+                "next.done": np.array([index == count - 1]),
+            }
             driven.append(frame)
         assert features is not None, "there are steps"
         with replacing(self.folder) as folder:
@@ -92,9 +95,11 @@ class SavedEpisodes:
         )
         if stored != wanted:
             raise FieldError(
-                "output_dir", self.folder, f"holds episodes with the columns {stored}, these have {wanted}",
+                "output_dir",
+                self.folder,
+                f"holds episodes with the columns {stored}, these have {wanted}",
                 "choose a new folder",
-            )  # fmt: skip
+            )
         return dataset
 
 

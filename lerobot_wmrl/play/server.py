@@ -53,9 +53,12 @@ class PlayServer:
     def application(self) -> web.Application:
         """Return the web application."""
         app = self.access.application(
-            "index.html", web.get("/world", self._describe), web.get("/drive", self._drive),
-            web.post("/picture", self._picture), largest=LARGEST_UPLOAD,
-        )  # fmt: skip
+            "index.html",
+            web.get("/world", self._describe),
+            web.get("/drive", self._drive),
+            web.post("/picture", self._picture),
+            largest=LARGEST_UPLOAD,
+        )
         app.on_shutdown.append(self._disconnect)
         app.on_cleanup.append(self._close)
         return app
@@ -133,9 +136,11 @@ class PlayServer:
             cameras = self.world.tokenizer_config.cameras
             if (names := sorted(name for name, _ in files)) != sorted(cameras):
                 raise FieldError(
-                    "picture", names, f"the world model sees the cameras {', '.join(cameras)}",
+                    "picture",
+                    names,
+                    f"the world model sees the cameras {', '.join(cameras)}",
                     "give one picture for each",
-                )  # fmt: skip
+                )
             images = {name: read_image(name, file) for name, file in files}
             state = json.loads(str(form["state"])) if "state" in form else None
             task = instruction(str(form.get("instruction", "")))

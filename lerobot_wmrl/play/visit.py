@@ -46,9 +46,12 @@ class Visit:
             FieldError: it cannot be done; nothing has changed.
         """
         does = {
-            "begin": self._begin, "step": self._step, "rewind": self._rewind, "save": self._save,
+            "begin": self._begin,
+            "step": self._step,
+            "rewind": self._rewind,
+            "save": self._save,
             "resume": self._resume,
-        }  # fmt: skip
+        }
         chosen = does.get(str(message.get("do")))
         if chosen is None:
             raise FieldError("do", message.get("do"), f"choose one of {', '.join(does)}")

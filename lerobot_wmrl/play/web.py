@@ -96,9 +96,12 @@ async def forever() -> None:
 
 
 def serve(
-    app: web.Application, access: Access, port: int, until: str,
+    app: web.Application,
+    access: Access,
+    port: int,
+    until: str,
     finished: Callable[[], Awaitable[Any]] = forever,
-) -> None:  # fmt: skip
+) -> None:
     """Serve until interrupted, and print the address.
 
     Args:
@@ -120,9 +123,11 @@ def serve(
                 await web.TCPSite(runner, access.host, port).start()
             except OSError as error:
                 raise FieldError(
-                    "port", port, f"cannot be served at {access.host} ({error})",
+                    "port",
+                    port,
+                    f"cannot be served at {access.host} ({error})",
                     "choose another port, or `host`",
-                ) from error  # fmt: skip
+                ) from error
             print(f"open {access.address(runner.addresses[0][1])} in a browser; {until}", flush=True)
             await finished()
         finally:

@@ -144,10 +144,11 @@ class World:
         if count != wanted:
             env.close()
             raise FieldError(
-                "real_env.type", self.real_env.type,
+                "real_env.type",
+                self.real_env.type,
                 f"takes actions of {count} components, the world model has learnt {wanted}",
                 "give the environment that its dataset is from",
-            )  # fmt: skip
+            )
         if self.model.embodiment.action_low:
             ends = self.model.embodiment.action_low, self.model.embodiment.action_high
             env.widen(*(torch.tensor(end, dtype=torch.float32) for end in ends))
@@ -177,10 +178,11 @@ class World:
             start = observed_frame(real.observation, self.tokenizer_config)
             if self.model.state_size not in (0, count := start.state.shape[1]):
                 raise FieldError(
-                    "real_env.type", self.real_env.type,
+                    "real_env.type",
+                    self.real_env.type,
                     f"has a state of {count} components, the world model has learnt {self.model.state_size}",
                     "give the environment that its dataset is from",
-                )  # fmt: skip
+                )
         else:
             start = self._uploaded(place)
         if wanted:
@@ -242,9 +244,12 @@ class World:
 
 
 def load_world(
-    config: WorldModelEnv, dataset: ChosenEpisodes, policy: PreTrainedConfig | None,
-    real_env: EnvConfig | None, end_at_success: bool = True,
-) -> World:  # fmt: skip
+    config: WorldModelEnv,
+    dataset: ChosenEpisodes,
+    policy: PreTrainedConfig | None,
+    real_env: EnvConfig | None,
+    end_at_success: bool = True,
+) -> World:
     """Load what `config` names, and check that dataset and policy fit the world model.
 
     Args:
@@ -273,9 +278,11 @@ def load_world(
         world.table = recorded.subset(recorded.among(dataset.episodes))
     if policy is not None and hasattr(policy, "proposal_path"):
         raise FieldError(
-            "policy.path", policy.pretrained_path, f"{policy.type} plans in a world model, as the page does",
+            "policy.path",
+            policy.pretrained_path,
+            f"{policy.type} plans in a world model, as the page does",
             "leave it out, or give the policy that it improves on (`proposal_path`)",
-        )  # fmt: skip
+        )
     if policy is not None:
         fit_to_environment(policy, world.model.observation_shapes, world.model.action_size)
         world.policy = LoadedPolicy.load(policy)

@@ -35,31 +35,14 @@ def frame_rewards(path: str, device: str | None, dataset: LeRobotDataset) -> np.
     Raises:
         FieldError: there is no such model, or it does not fit the dataset.
     """
-    try:
-        folder = local_model_folder(path)
-        config = RewardModelConfig.from_pretrained(folder)
-    except Exception as error:  # a missing file, a type that nobody registered, or what the hub answers
-        raise FieldError(
-            "path", path, f"no reward model of LeRobot there ({first_line(error)})",
-            "give the checkpoint of one, as lerobot-train --reward_model.type=… makes it",
-        ) from error  # fmt: skip
-    if config.type not in FRAME_REWARD_TYPES:
-        raise FieldError(
-            "path", path, f"a reward model of type {config.type} does not judge frames one by one",
-            f"give one of type {', '.join(FRAME_REWARD_TYPES)}, or write its rewards into a column and set "
-            "`success.type` to column",
-        )  # fmt: skip
-    config.pretrained_path, config.device = str(folder), device or config.device
-    missing = [name for name in config.input_features or () if name not in dataset.features]
-    if missing:
-        raise FieldError(
-            "path", path, f"looks at {', '.join(missing)}, which {dataset.root} has not",
-            "give a reward model that was trained on datasets like this",
-        )  # fmt: skip
+    config = read_reward_config(path, dataset)
+    config.device = device or config.device
     shown = LeRobotDataset(
-        dataset.repo_id, root=dataset.root, delta_timestamps=resolve_delta_timestamps(config, dataset.meta),
+        dataset.repo_id,
+        root=dataset.root,
+        delta_timestamps=resolve_delta_timestamps(config, dataset.meta),
         video_backend=VIDEO_BACKEND,
-    )  # fmt: skip
+    )
     with renamed("reward.pretrained_path", "path"):
         prepare = load_preprocessor(config)
     model = make_reward_model(config).eval()
@@ -70,3 +53,39 @@ def frame_rewards(path: str, device: str | None, dataset: LeRobotDataset) -> np.
             for batch in tqdm(batches, "label", unit="batch")
         ]
     return torch.cat(rewards).numpy().reshape(-1)
+
+
+def read_reward_config(path: str, dataset: LeRobotDataset) -> RewardModelConfig:
+    """Read the configuration of a reward model that judges a dataset's frames.
+
+    Raises:
+        FieldError: there is no such model, or it does not fit the dataset.
+    """
+    try:
+        folder = local_model_folder(path)
+        config = RewardModelConfig.from_pretrained(folder)
+    except Exception as error:  # a missing file, a type that nobody registered, or what the hub answers
+        raise FieldError(
+            "path",
+            path,
+            f"no reward model of LeRobot there ({first_line(error)})",
+            "give the checkpoint of one, as lerobot-train --reward_model.type=… makes it",
+        ) from error
+    if config.type not in FRAME_REWARD_TYPES:
+        raise FieldError(
+            "path",
+            path,
+            f"a reward model of type {config.type} does not judge frames one by one",
+            f"give one of type {', '.join(FRAME_REWARD_TYPES)}, or write its rewards into a column and set "
+            "`success.type` to column",
+        )
+    config.pretrained_path = str(folder)
+    missing = [name for name in config.input_features or () if name not in dataset.features]
+    if missing:
+        raise FieldError(
+            "path",
+            path,
+            f"looks at {', '.join(missing)}, which {dataset.root} has not",
+            "give a reward model that was trained on datasets like this",
+        )
+    return config

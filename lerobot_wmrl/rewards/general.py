@@ -104,6 +104,10 @@ class RuleBasedReward:
         `longest` is the number of steps that an episode may take.
         """
         return general_reward(
-            success, progress, previous,
-            alpha=self.alpha, form=self.form, gamma=potential_discount(self, longest),
-        )  # fmt: skip
+            success,
+            progress,
+            previous,
+            alpha=self.alpha,
+            form=self.form,
+            gamma=potential_discount(self, longest),
+        )

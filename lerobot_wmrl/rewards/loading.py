@@ -48,9 +48,11 @@ def load_reward(config: RewardModelConfig, model: ActionWorldModelRewardModel, l
         return load_lerobot_reward(config, model.config.tokenizer.camera_keys, device)
     if not config.pretrained_path:
         raise FieldError(
-            "reward.pretrained_path", config.pretrained_path, f"the {config.type} reward is learnt",
+            "reward.pretrained_path",
+            config.pretrained_path,
+            f"the {config.type} reward is learnt",
             f"train a reward model of type {config.type} with lerobot-train and give its output folder",
-        )  # fmt: skip
+        )
     reward: EmbeddingRewardModel | ProxyRewardModel = load_model(config.pretrained_path, config.type, device)
     reward.check_world_model(model)
     return reward
@@ -100,9 +102,11 @@ def load_preprocessor(config: RewardModelConfig) -> PolicyProcessorPipeline:
     saved = sorted(Path(config.pretrained_path).glob(PREPROCESSORS))
     if not saved:
         raise FieldError(
-            "reward.pretrained_path", config.pretrained_path, f"has no preprocessor ({PREPROCESSORS})",
+            "reward.pretrained_path",
+            config.pretrained_path,
+            f"has no preprocessor ({PREPROCESSORS})",
             "give a checkpoint as lerobot-train writes it",
-        )  # fmt: skip
+        )
     overrides = {"device_processor": {"device": config.device}}
     return PolicyProcessorPipeline.from_pretrained(
         saved[0].parent, config_filename=saved[0].name, overrides=overrides
@@ -113,13 +117,16 @@ def check_observation(config: RewardModelConfig, cameras: list[str]) -> None:
     """Raise FieldError unless one frame of `cameras` (dataset keys) is all that the reward needs."""
     if any(config.observation_delta_indices or ()):
         raise FieldError(
-            "reward.type", config.type, "looks at earlier or later frames than the one that it rewards",
+            "reward.type",
+            config.type,
+            "looks at earlier or later frames than the one that it rewards",
             "choose another reward",
-        )  # fmt: skip
+        )
     missing = [name for name in config.input_features if name.startswith(OBS_IMAGE) and name not in cameras]
     if missing:
         raise FieldError(
-            "reward.type", config.type,
+            "reward.type",
+            config.type,
             f"looks at {', '.join(missing)}, the world model imagines {', '.join(cameras)}",
             "train the reward on these cameras",
-        )  # fmt: skip
+        )

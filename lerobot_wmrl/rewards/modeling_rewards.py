@@ -43,9 +43,13 @@ class GeneralRewardModel(PreTrainedRewardModel):
         if gamma is None and config.form == "potential":
             raise FieldError("gamma", None, "how long episodes are is not known here", "give the discount")
         return general_reward(
-            batch["success"], batch["similarity"], batch["previous.similarity"],
-            alpha=config.alpha, form=config.form, gamma=gamma or 1.0,
-        )  # fmt: skip
+            batch["success"],
+            batch["similarity"],
+            batch["previous.similarity"],
+            alpha=config.alpha,
+            form=config.form,
+            gamma=gamma or 1.0,
+        )
 
 
 class ProxyRewardModel(HubCard, PreTrainedRewardModel):
@@ -63,11 +67,17 @@ class ProxyRewardModel(HubCard, PreTrainedRewardModel):
         require_at_least(config, 8, "image_size")
         width, last, side = config.width, 2 * config.width, -(-config.image_size // 8)
         self.layers = nn.Sequential(
-            nn.Conv2d(3 * len(config.cameras), width, 5, stride=2, padding=2), nn.ReLU(),
-            nn.Conv2d(width, last, 3, stride=2, padding=1), nn.ReLU(),
-            nn.Conv2d(last, last, 3, stride=2, padding=1), nn.ReLU(),
-            nn.Flatten(), nn.Linear(last * side**2, config.hidden), nn.ReLU(), nn.Linear(config.hidden, 1),
-        )  # fmt: skip
+            nn.Conv2d(3 * len(config.cameras), width, 5, stride=2, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(width, last, 3, stride=2, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(last, last, 3, stride=2, padding=1),
+            nn.ReLU(),
+            nn.Flatten(),
+            nn.Linear(last * side**2, config.hidden),
+            nn.ReLU(),
+            nn.Linear(config.hidden, 1),
+        )
 
     def _read_image_size(self, meta: Any) -> None:
         features = meta.features
@@ -81,11 +91,12 @@ class ProxyRewardModel(HubCard, PreTrainedRewardModel):
         cameras = model.config.tokenizer.cameras
         if not {*self.config.cameras} <= {*cameras}:
             raise FieldError(
-                "reward.pretrained_path", self.config.pretrained_path,
+                "reward.pretrained_path",
+                self.config.pretrained_path,
                 f"this proxy reward looks at {', '.join(self.config.cameras)}, the world model imagines "
                 f"{', '.join(cameras)}",
                 "train the reward again on the world model's cameras",
-            )  # fmt: skip
+            )
 
     def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss on frames that actions led to: images (B, 1, 3, H, W), `next.reward` (B, 1)."""
@@ -118,9 +129,11 @@ class EmbeddingRewardModel(HubCard, PreTrainedRewardModel):
             config.world_model = weights_digest(self.world_model.state_dict())
             config.hidden_size = self.world_model.config.dynamics.width
         self.head = nn.Sequential(
-            nn.LayerNorm(config.hidden_size), nn.Linear(config.hidden_size, config.hidden), nn.SiLU(),
+            nn.LayerNorm(config.hidden_size),
+            nn.Linear(config.hidden_size, config.hidden),
+            nn.SiLU(),
             nn.Linear(config.hidden, 1),
-        )  # fmt: skip
+        )
 
     @property
     def world_model(self) -> ActionWorldModelRewardModel:
@@ -129,9 +142,11 @@ class EmbeddingRewardModel(HubCard, PreTrainedRewardModel):
             path = self.config.world_model_path
             if not path:
                 raise FieldError(
-                    "world_model_path", path, "the reward is predicted from a world model's hidden states",
+                    "world_model_path",
+                    path,
+                    "the reward is predicted from a world model's hidden states",
                     "give the action world model",
-                )  # fmt: skip
+                )
             model = load_model(path, "action_world_model", self.config.device)
             self._world_model.append(model.requires_grad_(False))
         return self._world_model[0]
@@ -140,10 +155,11 @@ class EmbeddingRewardModel(HubCard, PreTrainedRewardModel):
         """Raise FieldError unless the head was trained on the hidden states of this very model."""
         if weights_digest(model.state_dict()) != self.config.world_model:
             raise FieldError(
-                "reward.pretrained_path", self.config.pretrained_path,
+                "reward.pretrained_path",
+                self.config.pretrained_path,
                 "this embedding reward was trained on the hidden states of another world model",
                 "train it again on those of `world_model_path`",
-            )  # fmt: skip
+            )
 
     def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss on LeRobot's windows (shapes as `clip_from_windows`), `next.reward` (B, T)."""

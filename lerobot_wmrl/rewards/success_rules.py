@@ -80,9 +80,11 @@ class FirstFramesRule(SuccessRule):
             begin, end = np.searchsorted(episode, (index, index + 1))
             if not 0 <= first < end - begin:
                 raise FieldError(
-                    "first", self.first, f"episode {index} has no frame {first}",
+                    "first",
+                    self.first,
+                    f"episode {index} has no frame {first}",
                     f"its frames are 0 to {end - begin - 1}",
-                )  # fmt: skip
+                )
             solved[begin + first : end] = True
         return next_frame_solved(solved, dataset)
 
@@ -107,9 +109,11 @@ class ColumnRule(SuccessRule):
         if feature is None or tuple(feature["shape"]) != (1,) or feature["dtype"] == "string":
             single = [name for name, each in dataset.features.items() if tuple(each["shape"]) == (1,)]
             raise FieldError(
-                "column", self.column, f"is no column of one number in {dataset.root}",
+                "column",
+                self.column,
+                f"is no column of one number in {dataset.root}",
                 f"choose one of {', '.join(single)}",
-            )  # fmt: skip
+            )
         rows = dataset.hf_dataset.with_format("numpy", columns=[self.column])[:]
         return reach(np.asarray(rows[self.column], np.float64).reshape(-1), self.threshold)
 
@@ -143,15 +147,19 @@ def whole_numbers(name: str, pairs: Mapping[str, float | None]) -> dict[int, int
     """Return episodes and frames as whole numbers. FieldError names a pair that is not of two."""
     if None in pairs.values():  # YAML reads `0:45` as a text or one number of base 60
         raise FieldError(
-            name, pairs, "does not say from which frame on an episode is solved",
+            name,
+            pairs,
+            "does not say from which frame on an episode is solved",
             "write a space after each colon: {0: 120, 3: 95}",
-        )  # fmt: skip
+        )
     for episode, frame in pairs.items():
         if not (str(episode).lstrip("-").isdecimal() and float(frame or 0).is_integer()):
             raise FieldError(
-                name, pairs, f"{episode}: {frame} is not an episode and a frame",
+                name,
+                pairs,
+                f"{episode}: {frame} is not an episode and a frame",
                 "give whole numbers: {0: 120, 3: 95}",
-            )  # fmt: skip
+            )
     return {int(episode): int(frame or 0) for episode, frame in pairs.items()}
 
 
@@ -207,8 +215,9 @@ def reach(values: np.ndarray, threshold: float) -> np.ndarray:
         raise FieldError("threshold", threshold, f"cannot be compared with frame {frame}: {values[frame]}")
     if not (values >= threshold).any():
         raise FieldError(
-            "threshold", threshold, f"no frame reaches it: the values go from {values.min():.3g} to "
-            f"{values.max():.3g}",
+            "threshold",
+            threshold,
+            f"no frame reaches it: the values go from {values.min():.3g} to {values.max():.3g}",
             "lower it, or say that every episode fails: --success.type=ends --success.episodes=[]",
-        )  # fmt: skip
+        )
     return np.asarray(values >= threshold)

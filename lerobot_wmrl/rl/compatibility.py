@@ -44,21 +44,25 @@ def check_tasks(cfg: TrainConfig, env: TensorEnv) -> None:
     tasks, compares_starts = env.tasks, cfg.algorithm.compares_starts
     if compares_starts and tasks > 1:
         raise FieldError(
-            "algorithm.type", cfg.algorithm.type,
+            "algorithm.type",
+            cfg.algorithm.type,
             f"compares episodes from the same start, and the environment has {tasks} tasks",
             "choose one task, or ppo",
-        )  # fmt: skip
+        )
     if compares_starts and not env.repeats_starts():
         raise FieldError(
-            "algorithm.type", cfg.algorithm.type,
+            "algorithm.type",
+            cfg.algorithm.type,
             "compares episodes from the same start, and in this environment a seed does not decide it",
             "choose ppo",
-        )  # fmt: skip
+        )
     if tasks > env.num_envs:
         raise FieldError(
-            "num_envs", env.num_envs, f"the environment has {tasks} tasks, and each needs one of its own",
+            "num_envs",
+            env.num_envs,
+            f"the environment has {tasks} tasks, and each needs one of its own",
             f"set it to a multiple of {tasks}, or choose fewer tasks",
-        )  # fmt: skip
+        )
 
 
 def settle_discount(cfg: TrainConfig) -> None:
@@ -88,8 +92,11 @@ def warn_of_discount(cfg: TrainConfig, longest: int) -> None:
         logging.warning(
             "env.reward.gamma=%s: progress is rewarded with this discount, and %s has %s, so that the time "
             "spent near the goal counts too; set --env.reward.gamma=%s",
-            reward_discount, cfg.algorithm.type.upper(), discount, discount,
-        )  # fmt: skip
+            reward_discount,
+            cfg.algorithm.type.upper(),
+            discount,
+            discount,
+        )
 
 
 def rollout_length(cfg: TrainConfig, longest: int) -> int:
@@ -97,10 +104,12 @@ def rollout_length(cfg: TrainConfig, longest: int) -> int:
     steps = cfg.rollout_steps or longest
     if steps < longest:
         raise FieldError(
-            "rollout_steps", steps,
+            "rollout_steps",
+            steps,
             f"episodes last up to {longest} steps and every rollout starts new ones, so their ends would "
-            "never be trained on", "raise it, or lower `env.episode_length`",
-        )  # fmt: skip
+            "never be trained on",
+            "raise it, or lower `env.episode_length`",
+        )
     return steps
 
 
@@ -118,15 +127,19 @@ def check_std(policy: Any, stochastic: Any, std: float) -> None:
         )
     if stochastic is policy and unwrapped(policy) is not policy:
         raise FieldError(
-            "algorithm.initial_std", std, "is none of the adapters' parameters, which checkpoints hold alone",
+            "algorithm.initial_std",
+            std,
+            "is none of the adapters' parameters, which checkpoints hold alone",
             "set it to null, or train without adapters",
-        )  # fmt: skip
+        )
 
 
 def require_encoder(stochastic: Any) -> None:
     """Raise FieldError unless what samples actions has an encoder that can be kept as it was cloned."""
     if not isinstance(unwrapped(stochastic), EncodingPolicy):
         raise FieldError(
-            "algorithm.train_encoder", False, "this policy has no encoder that can be kept",
+            "algorithm.train_encoder",
+            False,
+            "this policy has no encoder that can be kept",
             "set it to true, or take the policy cnn",
-        )  # fmt: skip
+        )

@@ -128,8 +128,10 @@ class PPOConfig(PolicyGradientConfig):
         if self.value_iterations >= iterations:
             logging.warning(
                 "iterations=%d: the policy stays as it is, because the value function alone learns in the "
-                "first %d (algorithm.value_iterations)", iterations, self.value_iterations,
-            )  # fmt: skip
+                "first %d (algorithm.value_iterations)",
+                iterations,
+                self.value_iterations,
+            )
 
     def discount(self, longest: int) -> float:
         """Return the discount factor of rewards in episodes of up to `longest` steps."""

@@ -135,21 +135,23 @@ class CallbackSettings:
     def _check_selection_is_imagined(self, env: EnvConfig) -> None:
         if self.real_env is not None or not isinstance(env, WorldModelEnv):
             raise FieldError(
-                "selection.freq", self.selection.freq,
+                "selection.freq",
+                self.selection.freq,
                 "under a budget, selection must be in a world model: its episodes in the simulator would be "
                 "counted nowhere",
                 "leave out `real_env.type`, or `selection.freq`",
-            )  # fmt: skip
+            )
 
     def _check_gate_has_labels(self) -> None:
         if not self.gate.dataset.given and self.real_env is None:
             raise FieldError(
-                "gate.action", self.gate.action,
+                "gate.action",
+                self.gate.action,
                 "no episode says what success is outside the world model, so its false positives cannot be "
                 "counted",
                 "give labelled rollouts (`gate.dataset.root`) or an environment to record some in "
                 "(`real_env.type`), or train unchecked with `gate.action` warn",
-            )  # fmt: skip
+            )
 
     def _check_dyna_sizes(self, iterations: int) -> None:
         dyna = self.dyna

@@ -67,12 +67,14 @@ class DistillationConfig(AlgorithmConfig):
         """Raise FieldError unless the planner can look ahead in the environment."""
         if not isinstance(env, WorldModelEnv):
             raise FieldError(
-                "algorithm.type", "distillation",
+                "algorithm.type",
+                "distillation",
                 f"its planner looks ahead in a world model, and `env.type` is {env.type}",
                 "set `env.type` to world_model, or choose ppo or grpo",
-            )  # fmt: skip
+            )
         if env.done_frames > self.planner.horizon:
             raise FieldError(
-                "algorithm.planner.horizon", self.planner.horizon,
+                "algorithm.planner.horizon",
+                self.planner.horizon,
                 f"must be at least `env.done_frames`, {env.done_frames}",
-            )  # fmt: skip
+            )

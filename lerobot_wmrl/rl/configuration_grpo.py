@@ -44,10 +44,11 @@ class GRPOConfig(PolicyGradientConfig):
         """Raise FieldError unless the environments can be divided into groups."""
         if num_envs % self.group_size:
             raise FieldError(
-                "num_envs", num_envs,
+                "num_envs",
+                num_envs,
                 f"must be a multiple of `algorithm.group_size={self.group_size}`, the environments that "
                 "start from the same state",
-            )  # fmt: skip
+            )
 
     def discount(self, longest: int) -> float:
         """Return 1: the rewards of an episode are added up."""

@@ -27,9 +27,14 @@ READ = ("input_features", "output_features", "use_peft", "pretrained_path")
 """Settings of the policy that its checkpoint alone knows: the training may fill them in."""
 
 MAY_DIFFER = (
-    "resume", "job_name", "log_freq", "wandb", "gate.action", "dyna.dataset",
+    "resume",
+    "job_name",
+    "log_freq",
+    "wandb",
+    "gate.action",
+    "dyna.dataset",
     *(f"policy.{name}" for name in PUBLISHING),
-)  # fmt: skip
+)
 """Settings that may change when a run is resumed."""
 
 
@@ -144,7 +149,9 @@ def require_published_base(cfg: TrainConfig, policy: PreTrainedConfig) -> None:
         base = adapter_config(policy).base_model_name_or_path
     if base is not None and published_name(base) is None:
         raise FieldError(
-            "policy.push_to_hub", True, f"the adapters belong to the policy in {base}, which nobody else has",
+            "policy.push_to_hub",
+            True,
+            f"the adapters belong to the policy in {base}, which nobody else has",
             "publish that one, and give its name on the hub: with new adapters as `policy.path`, else in "
             "adapter_config.json, base_model_name_or_path",
-        )  # fmt: skip
+        )

@@ -193,9 +193,16 @@ class Distillation(Algorithm):
         It follows averages: labels vary less, and a policy fitted to them succeeds more often.
         """
         return Planner(
-            env.model, None, self.config.planner, env.config.done_frames, averaged=True,
-            low=env.action_low, high=env.action_high, seed=seed, searched=learnt,
-        )  # fmt: skip
+            env.model,
+            None,
+            self.config.planner,
+            env.config.done_frames,
+            averaged=True,
+            low=env.action_low,
+            high=env.action_high,
+            seed=seed,
+            searched=learnt,
+        )
 
     def learnt_components(self, env: WorldModelVectorEnv, pipeline: Pipeline) -> Tensor:
         """Return which components of actions the policy can learn, see `LEAST_STD_SHARE`. (A,)"""
@@ -214,12 +221,13 @@ class Distillation(Algorithm):
         if strange:
             name = env.model.config.embodiment.action_names[strange[0]]
             raise FieldError(
-                "algorithm.recorded", True,
+                "algorithm.recorded",
+                True,
                 f"{name} varies in the recorded episodes, and hardly where the policy was trained: its "
                 "errors would outweigh all others",
                 "set it to false, or train the policy further on these episodes first (lerobot-train "
                 "--policy.path)",
-            )  # fmt: skip
+            )
 
     def batches(self, updates: int, pipeline: Pipeline) -> Iterator[dict[str, Any]]:
         """Draw that many batches of labels."""

@@ -14,7 +14,7 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.constants import DYNA
 from lerobot_wmrl.common.errors import TrainingStopped
-from lerobot_wmrl.common.flags import Flags, format_flags
+from lerobot_wmrl.common.flags import Flags, program_call
 from lerobot_wmrl.common.precision import device_setting
 from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.common.seeds import dyna_seed
@@ -128,13 +128,19 @@ class DynaRounds:
         if number:
             initial = str(self._world_model(self.iterations[number - 1]))
         flags: Flags = {
-            "model.path": initial, "model.device": device_setting(self.env.device), **self.learnt.flags(),
-            "dataset.more": more, "model.learning_rate": LEARNING_RATE,
-            "steps": self.config.steps, "batch_size": self.config.batch_size,
-            "save_freq": max(1, self.config.steps // 4), "seed": self.seed + number,
-            "output_dir": str(output_dir), **budget_flags(self.budget),
-        }  # fmt: skip
-        run_subcommand(["lerobot-wmrl-train-world-model", *format_flags(flags)])
+            "model.path": initial,
+            "model.device": device_setting(self.env.device),
+            **self.learnt.flags(),
+            "dataset.more": more,
+            "model.learning_rate": LEARNING_RATE,
+            "steps": self.config.steps,
+            "batch_size": self.config.batch_size,
+            "save_freq": max(1, self.config.steps // 4),
+            "seed": self.seed + number,
+            "output_dir": str(output_dir),
+            **budget_flags(self.budget),
+        }
+        run_subcommand(program_call("lerobot-wmrl-train-world-model", flags))
 
     def _folder(self, iteration: int) -> Path:
         return record_folder(self.output_dir, self.name, iteration, self.total)

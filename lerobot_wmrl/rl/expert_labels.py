@@ -140,10 +140,11 @@ class ExpertLabels:
             part, begin = parts[index], int(ends[index - 1]) if index else 0
             taken.append(shown(part.batch(drawn[part_of == index] - begin)))
         return {
-            name: [text for batch in taken for text in batch[name]] if name == INSTRUCTIONS
+            name: [text for batch in taken for text in batch[name]]
+            if name == INSTRUCTIONS
             else torch.cat([batch[name] for batch in taken])
             for name in taken[0]
-        }  # fmt: skip
+        }
 
     def _append(self, tensors: dict[str, Tensor], instructions: list[str]) -> None:
         rows = tensors.pop(ROWS)
@@ -187,11 +188,14 @@ def recorded_successes(
         rows = (start - begin)[episode] + torch.arange(len(episode))
         observations[OBS_STATE] = torch.from_numpy(table.state[rows.numpy()])
     step, labelled = acting.nonzero(as_tuple=True)
-    return [ExpertLabelBatch(
-        observations | {INSTRUCTIONS: episode}, actions,
-        observed_rows(begin[labelled], step, windows.observations),
-        [table.instructions[each] for each in episodes],
-    )]  # fmt: skip
+    return [
+        ExpertLabelBatch(
+            observations | {INSTRUCTIONS: episode},
+            actions,
+            observed_rows(begin[labelled], step, windows.observations),
+            [table.instructions[each] for each in episodes],
+        )
+    ]
 
 
 def successes(source: StartFrames) -> tuple[EpisodeTable, np.ndarray]:
@@ -212,11 +216,12 @@ def require_memory(source: StartFrames, frame_shapes: Mapping[str, tuple[int, in
     free = psutil.virtual_memory().available
     if size > free:
         raise FieldError(
-            "algorithm.recorded", True,
+            "algorithm.recorded",
+            True,
             f"the frames of the recorded successes take {size / 1e9:.1f} GB of memory, and "
             f"{free / 1e9:.1f} GB are free",
             "set it to false, or choose fewer episodes (`env.dataset.episodes`)",
-        )  # fmt: skip
+        )
 
 
 def imagined_labels(
@@ -234,9 +239,11 @@ def imagined_labels(
     wanted = observed_rows(env, step, windows.observations, observations.num_envs)
     kept, rows = wanted.unique(return_inverse=True)
     return ExpertLabelBatch(
-        observations.read_stored(kept.cpu()), action_windows(actions, labelled, windows.actions), rows,
+        observations.read_stored(kept.cpu()),
+        action_windows(actions, labelled, windows.actions),
+        rows,
         list(observations.instructions),
-    )  # fmt: skip
+    )
 
 
 def observed_rows(first: Tensor, step: Tensor, distances: Sequence[int] | None, stride: int = 1) -> Tensor:

@@ -33,10 +33,18 @@ def make_callbacks(cfg: TrainConfig, policy: LoadedPolicy, env: TensorEnv) -> li
         recorder = make_recorder(cfg, env)
         if cfg.dyna.rounds:
             learnt, elsewhere = cfg.learnt(cfg.env), cfg.dyna.dataset.roots is not None
-            callbacks.append(DynaRounds(
-                cfg.dyna, env, None if elsewhere else recorder, learnt, cfg.output_dir, cfg.iterations,
-                cfg.seed, cfg.budget,
-            ))  # fmt: skip
+            callbacks.append(
+                DynaRounds(
+                    cfg.dyna,
+                    env,
+                    None if elsewhere else recorder,
+                    learnt,
+                    cfg.output_dir,
+                    cfg.iterations,
+                    cfg.seed,
+                    cfg.budget,
+                )
+            )
         if cfg.gate.action != "off":
             callbacks.append(SuccessGate(cfg.gate, env, recorder, refreshed, cfg.iterations))
     if cfg.selection.freq:

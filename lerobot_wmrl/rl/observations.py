@@ -58,11 +58,13 @@ class ObservationBuffer:
 def as_policy_input(stored: dict[str, Tensor], instructions: Sequence[str]) -> Observation:
     """Return stored observations as the policy sees them: images in [0, 1], instructions as texts."""
     return {
-        name: from_bytes(value) if name.startswith(OBS_IMAGE)
-        else [instructions[index] for index in value.tolist()] if name == INSTRUCTIONS
+        name: from_bytes(value)
+        if name.startswith(OBS_IMAGE)
+        else [instructions[index] for index in value.tolist()]
+        if name == INSTRUCTIONS
         else value
         for name, value in stored.items()
-    }  # fmt: skip
+    }
 
 
 def at_rows(observation: Observation, rows: Tensor) -> Observation:

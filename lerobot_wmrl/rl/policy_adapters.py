@@ -107,8 +107,9 @@ def as_stochastic(policy: Any) -> Any:
         return policy
     if policy.config.type not in ADAPTERS:
         raise FieldError(
-            "policy.type", policy.config.type,
+            "policy.type",
+            policy.config.type,
             "reinforcement learning needs a policy with `sample`, `evaluate`, `value` and `value_parameters`",
             f"take one that has them, for example cnn, or one of {', '.join(ADAPTERS)}",
-        )  # fmt: skip
+        )
     return ADAPTERS[policy.config.type](policy)

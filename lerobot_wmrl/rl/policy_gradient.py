@@ -100,10 +100,11 @@ class PolicyGradient(Algorithm):
         ]
         if not (config.train_encoder or self.policy_parameters):
             raise FieldError(
-                "algorithm.train_encoder", config.train_encoder,
+                "algorithm.train_encoder",
+                config.train_encoder,
                 "leaves nothing of the policy to train: its adapters are all in the encoder",
                 "set it to true, or give adapters to other layers (`peft.target_modules`)",
-            )  # fmt: skip
+            )
         require_exact_updates(self.policy_parameters)
         self.optimizer = self.make_optimizers_and_scheduler()[self.name]
         group = list(self.parameter_groups()).index(POLICY)
@@ -155,8 +156,9 @@ class PolicyGradient(Algorithm):
             raise TrainingStopped(
                 f"iteration {self.iteration + 1}: the policy is {kl:.3g} nats a step from the "
                 f"SFT policy, above `algorithm.max_reference_kl` ({self.config.max_reference_kl}); raise "
-                "`algorithm.reference_coefficient` or lower `algorithm.policy_lr`", before_update=True,
-            )  # fmt: skip
+                "`algorithm.reference_coefficient` or lower `algorithm.policy_lr`",
+                before_update=True,
+            )
 
     def signal(self, rollout: RolloutBuffer) -> Tensor:
         """Return a number above 0 if there is something to learn from. ()"""
@@ -172,8 +174,9 @@ class PolicyGradient(Algorithm):
                 f"iteration {self.iteration + 1}: {self.without_signal} in {self.unrewarded} iterations, "
                 "so there is nothing to learn from. If imagination sees no success, lower "
                 "`env.done_threshold`, or train the world model longer or on more successes; if the policy "
-                "has none, take one that has, or raise `algorithm.initial_std`", before_update=True,
-            )  # fmt: skip
+                "has none, take one that has, or raise `algorithm.initial_std`",
+                before_update=True,
+            )
 
     def trained_groups(self) -> list[str]:
         """Return the names of the parameter groups that this iteration trains."""
@@ -285,8 +288,11 @@ class PolicyGradient(Algorithm):
             return False
         logging.info(
             "iteration %d: one step has moved the policy by %.3g nats, and is undone; its learning rate is "
-            "now %.2g", self.iteration + 1, kl, self.trust_region.group["lr"],
-        )  # fmt: skip
+            "now %.2g",
+            self.iteration + 1,
+            kl,
+            self.trust_region.group["lr"],
+        )
         return True
 
     def measure(self, minibatch: Minibatch, backward: bool) -> dict[str, float]:

@@ -16,9 +16,15 @@ from lerobot_wmrl.rl.rollout import RolloutBuffer
 
 
 def generalised_advantages(
-    reward: Tensor, value: Tensor, next_value: Tensor, terminated: Tensor, truncated: Tensor,
-    gamma: float, gae_lambda: float, decided: Tensor | None = None,
-) -> Tensor:  # fmt: skip
+    reward: Tensor,
+    value: Tensor,
+    next_value: Tensor,
+    terminated: Tensor,
+    truncated: Tensor,
+    gamma: float,
+    gae_lambda: float,
+    decided: Tensor | None = None,
+) -> Tensor:
     """Return A_t = δ_t + γλ A_{t+1}, δ_t = r_t + γ V(o_{t+1}) − V(o_t) (Schulman et al. 2016, eq. 16).
 
     Args:
@@ -71,10 +77,11 @@ class PPO(PolicyGradient):
         super().__init__(policy, config)
         if not any(parameter.requires_grad for parameter in self.value_parameters):
             raise FieldError(
-                "peft.full_training_modules", None,
+                "peft.full_training_modules",
+                None,
                 "adapters leave the value function as it is, and PPO trains it",
                 "name its module there (`critic` of a cnn policy, `value_head` of OpenVLA), or take grpo",
-            )  # fmt: skip
+            )
         self.return_scale = ReturnScale()
 
     def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
@@ -99,9 +106,15 @@ class PPO(PolicyGradient):
         config, decided, scale = self.config, rollout.decided, self.return_scale
         value, next_value = scale.restore(rollout.value), scale.restore(rollout.next_value)  # (T, B)
         advantages = generalised_advantages(
-            rollout.reward, value, next_value, rollout.terminated, rollout.truncated,
-            config.discount(rollout.longest), config.gae_lambda, decided,
-        )  # fmt: skip
+            rollout.reward,
+            value,
+            next_value,
+            rollout.terminated,
+            rollout.truncated,
+            config.discount(rollout.longest),
+            config.gae_lambda,
+            decided,
+        )
         target = advantages + value  # (T, B), the λ-returns
         if config.value_normalisation:
             scale.update(target[decided])

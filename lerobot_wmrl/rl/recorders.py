@@ -10,7 +10,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from tqdm import trange
 
-from lerobot_wmrl.common.flags import Flags, env_flags, format_flags
+from lerobot_wmrl.common.flags import Flags, env_flags, program_call
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.data.dataset import open_dataset
@@ -60,13 +60,18 @@ class ManiSkillRecorder:
         self, checkpoint: Path, episodes: int, seed: int, folder: Path, exploration: float = 0.0
     ) -> None:
         flags: Flags = {
-            "policy.path": str(checkpoint / PRETRAINED_MODEL_DIR), "num_workers": self.num_workers,
+            "policy.path": str(checkpoint / PRETRAINED_MODEL_DIR),
+            "num_workers": self.num_workers,
             **env_flags(replace(self.env, batched=False)),  # each worker has a simulation of its own
-            "env.cameras": list(self.cameras), "depth": self.depth,
-            "num_episodes": episodes, "seed": seed, "exploration": exploration, "output_dir": str(folder),
+            "env.cameras": list(self.cameras),
+            "depth": self.depth,
+            "num_episodes": episodes,
+            "seed": seed,
+            "exploration": exploration,
+            "output_dir": str(folder),
             **budget_flags(self.budget),
-        }  # fmt: skip
-        run_subcommand(["lerobot-wmrl-record", *format_flags(flags)])
+        }
+        run_subcommand(program_call("lerobot-wmrl-record", flags))
 
 
 @dataclass(frozen=True)

@@ -185,9 +185,13 @@ class Actor:
 
 @torch.no_grad()
 def collect(
-    env: TensorEnv, policy: StochasticPolicy, pipeline: Pipeline, buffer: RolloutBuffer, seed: int,
+    env: TensorEnv,
+    policy: StochasticPolicy,
+    pipeline: Pipeline,
+    buffer: RolloutBuffer,
+    seed: int,
     group_size: int = 1,
-) -> dict[str, float]:  # fmt: skip
+) -> dict[str, float]:
     """Fill `buffer` with T steps of new episodes, and return metrics, averaged over all processes.
 
     Args:

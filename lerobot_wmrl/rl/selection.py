@@ -33,9 +33,13 @@ class Selection:
     name = "selection"
 
     def __init__(
-        self, freq: int, total: int, measures: Mapping[str, Measure], output_dir: Path,
+        self,
+        freq: int,
+        total: int,
+        measures: Mapping[str, Measure],
+        output_dir: Path,
         refreshed: Collection[int] = (),
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.freq, self.total, self.measures, self.output_dir = freq, total, measures, output_dir
         self.refreshed = refreshed
         self.judge = REAL if REAL in measures else IMAGINED

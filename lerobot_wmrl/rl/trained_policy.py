@@ -103,11 +103,13 @@ def publish(cfg: TrainConfig, lines: list[str]) -> None:
     with within("policy"), publishing(config.repo_id, kept), TemporaryDirectory() as temporary:
         name = create_repo(api, config.repo_id, config.private)
         card = CARD.format(
-            metadata=card_metadata(config, model_name=name).to_yaml(), name=name, type=config.type,
+            metadata=card_metadata(config, model_name=name).to_yaml(),
+            name=name,
+            type=config.type,
             description=description,
             start=f"`{'@'.join(filter(None, start))}`" if start else "a policy that is not published",
             command=evaluation(cfg, name, shared=True),
-        )  # fmt: skip
+        )
         folder = Path(temporary) / "policy"
         shutil.copytree(chosen_checkpoint(cfg) / PRETRAINED_MODEL_DIR, folder)
         (folder / "README.md").write_text(card)

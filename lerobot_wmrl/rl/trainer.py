@@ -1,6 +1,6 @@
 """The training loop: collect, update, log, save, and run callbacks. It resumes bit for bit on a CPU."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -37,9 +37,19 @@ from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.seeds import first_seed
 
 SHOWN = (
-    "success_rate", "reward", "groups_with_signal", "policy_loss", "value_loss", "explained_variance", "kl",
-    "reference_kl", "clip_fraction", "entropy", "rollout_s", "update_s",
-)  # fmt: skip
+    "success_rate",
+    "reward",
+    "groups_with_signal",
+    "policy_loss",
+    "value_loss",
+    "explained_variance",
+    "kl",
+    "reference_kl",
+    "clip_fraction",
+    "entropy",
+    "rollout_s",
+    "update_s",
+)
 """Metrics that a line in the terminal shows; metrics.jsonl has all."""
 
 IN_PROGRESS_BAR = ("success_rate", "reference_kl")
@@ -71,10 +81,16 @@ def make_algorithm(policy: Any, config: RLAlgorithmConfig, output_dir: Path) -> 
 
 
 def train(
-    env: gym.vector.VectorEnv, algorithm: Algorithm, pipeline: Pipeline, rollout: RolloutBuffer,
-    schedule: Schedule, output_dir: Path, save_pretrained: Callable[[Path], None],
-    callbacks: Sequence[Callback] = (), wandb: Any = None,
-) -> None:  # fmt: skip
+    env: gym.vector.VectorEnv,
+    algorithm: Algorithm,
+    pipeline: Pipeline,
+    rollout: RolloutBuffer,
+    schedule: Schedule,
+    output_dir: Path,
+    save_pretrained: Callable[[Path], None],
+    callbacks: Sequence[Callback] = (),
+    wandb: Any = None,
+) -> None:
     """Train until the end of the schedule, from the latest checkpoint in `output_dir` if there is one.
 
     Every iteration starts new episodes, so one that was killed can be repeated. Callbacks that are due run
@@ -99,10 +115,7 @@ def train(
     write = partial(save, algorithm, output_dir, total, save_pretrained)
     tracker = make_tracker(output_dir, rollout, schedule, algorithm.iteration, wandb)
     runner = Callbacks(callbacks, output_dir, total, tracker)
-    with tqdm(
-        total=total, initial=algorithm.iteration, desc=algorithm.name.upper(), unit="iteration",
-        disable=not is_first_process(),
-    ) as progress:  # fmt: skip
+    with progress_bar(algorithm, total) as progress:
         runner.resume(algorithm.iteration)
         wait_for_all()  # else a slow process would read records that the first one writes below
         if runner.due(algorithm.iteration):
@@ -112,14 +125,23 @@ def train(
                 metrics = iterate(env, algorithm, pipeline, rollout, schedule)
             step = algorithm.iteration
             tracker.log_step(step, {**metrics, **runner.real_steps()})
-            progress.set_postfix(
-                {name: f"{metrics[name]:.2f}" for name in IN_PROGRESS_BAR if name in metrics}
-            )
-            progress.update()
+            advance(progress, metrics)
             if should_save_checkpoint(step, schedule.save_freq, total) or runner.due(step):
                 checkpoint = write()
                 tracker.log_policy(checkpoint)
                 runner.run(step, checkpoint)
+
+
+def progress_bar(algorithm: Algorithm, total: int) -> tqdm:
+    """Return a progress bar over the iterations; of several processes the first shows it."""
+    name, begun = algorithm.name.upper(), algorithm.iteration
+    return tqdm(total=total, initial=begun, desc=name, unit="iteration", disable=not is_first_process())
+
+
+def advance(progress: tqdm, metrics: Mapping[str, float]) -> None:
+    """Show an iteration's metrics beside the progress bar."""
+    progress.set_postfix({name: f"{metrics[name]:.2f}" for name in IN_PROGRESS_BAR if name in metrics})
+    progress.update()
 
 
 @contextmanager

@@ -79,17 +79,21 @@ class CompareConfig(RunConfig):
             )
         if self.env is None:
             raise FieldError(
-                "env.type", None, "is missing: policies are compared in an environment",
+                "env.type",
+                None,
+                "is missing: policies are compared in an environment",
                 "set it to wmrl_maniskill, world_model or one of LeRobot's, with its settings",
-            )  # fmt: skip
+            )
         require_choice(self, "against", ("first", "all"))
         require_at_least(self, 1, "n_episodes", "batch_size")
         require_at_least(self, 0, "seed")
         if self.batch_size > self.n_episodes:
             raise FieldError(
-                "batch_size", self.batch_size, f"there are {self.n_episodes} episodes",
+                "batch_size",
+                self.batch_size,
+                f"there are {self.n_episodes} episodes",
                 "lower it, or raise `n_episodes`",
-            )  # fmt: skip
+            )
         require_probability(self, "alpha")
 
 

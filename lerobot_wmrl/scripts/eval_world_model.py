@@ -142,15 +142,18 @@ class EvalWorldModelConfig(RunConfig):
         require_probability(self, "done_threshold")
         if self.push_to_hub and Path(self.model.path).exists():
             raise FieldError(
-                "push_to_hub", True, f"{self.model.path} is a folder here",
+                "push_to_hub",
+                True,
+                f"{self.model.path} is a folder here",
                 "publish it by lerobot-wmrl-train-world-model, and give its name there as `model.path`",
-            )  # fmt: skip
+            )
         if self.policies and self.real_env is None:
             raise FieldError(
-                "real_env.type", None,
+                "real_env.type",
+                None,
                 "is missing: success in the world model is compared with success in an environment",
                 "set it to wmrl_maniskill, with its settings, or leave out `policies`",
-            )  # fmt: skip
+            )
 
 
 def eval_world_model(cfg: EvalWorldModelConfig) -> None:
@@ -182,8 +185,10 @@ def warn_of_learnt(world_model: str, rollouts: LabelledRollouts) -> None:
         logging.warning(
             "%s: the world model has learnt from %d of these %d episodes, and predicts them better than "
             "others. Take those that were held out (--split=validation), or rollouts that it has not seen",
-            rollouts.name, learnt, len(rollouts.chosen),
-        )  # fmt: skip
+            rollouts.name,
+            learnt,
+            len(rollouts.chosen),
+        )
 
 
 def measure(
@@ -284,26 +289,33 @@ def policies_imagination(cfg: EvalWorldModelConfig, table: EpisodeTable) -> Worl
     tasks = cfg.real_env.task_names if isinstance(cfg.real_env, WmrlManiSkillEnv) else None
     if tasks is not None and len(tasks) > 1:
         raise FieldError(
-            "real_env.task", ",".join(tasks), "the success of `policies` is compared in one task at a time",
+            "real_env.task",
+            ",".join(tasks),
+            "the success of `policies` is compared in one task at a time",
             "choose one",
-        )  # fmt: skip
+        )
     starts = StartFrames(**vars(cfg.dataset), split=cfg.split, tasks=tasks, max_starts=cfg.policy_episodes)
     assert cfg.real_env is not None, "the settings were checked"
     longest = frame_limit(cfg.real_env)
     with renamed("world_model_path", "model.path"):
         imagination = WorldModelEnv(
-            world_model_path=cfg.model.path, reward=GeneralConfig(alpha=1.0), device=cfg.device,
-            episode_length=longest, dataset=starts,
-            done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
-        )  # fmt: skip
+            world_model_path=cfg.model.path,
+            reward=GeneralConfig(alpha=1.0),
+            device=cfg.device,
+            episode_length=longest,
+            dataset=starts,
+            done_threshold=cfg.done_threshold,
+            done_frames=cfg.done_frames,
+        )
     with renamed("dataset.split", "split"):
         available = len(chosen_episodes(table, starts))
     if available < cfg.policy_episodes:
         raise FieldError(
-            "policy_episodes", cfg.policy_episodes,
+            "policy_episodes",
+            cfg.policy_episodes,
             f"the dataset has {available} starts, and an episode that is repeated says nothing new",
             f"set it to at most {available}, or choose another `split`",
-        )  # fmt: skip
+        )
     return imagination
 
 
@@ -348,11 +360,15 @@ def report_text_model(
     """Report goal frames, and draw the reward along the shown episodes."""
     curves = {
         name: reward_along_episode(
-            text_model, cfg.reward, recording, replay,
-            criterion=cfg.criterion, longest=longest,
+            text_model,
+            cfg.reward,
+            recording,
+            replay,
+            criterion=cfg.criterion,
+            longest=longest,
         )
         for name, replay in evaluation.shown.items()
-    }  # fmt: skip
+    }
     save_reward_curves(curves, cfg.output_dir / "reward_along_episodes.png")
     return report_goals(text_model, recording, evaluation, cfg.output_dir)
 

@@ -28,6 +28,7 @@ from lerobot_wmrl.improve.plan import Plan
 from lerobot_wmrl.improve.progress import Progress
 from lerobot_wmrl.improve.report.page import Page
 from lerobot_wmrl.improve.report.words import verdict
+from lerobot_wmrl.improve.stages import list_stages
 
 
 def improve(cfg: ImproveConfig) -> None:
@@ -36,7 +37,7 @@ def improve(cfg: ImproveConfig) -> None:
     plan = Plan.of(cfg)
     print(f"{cfg.dataset.name}:\n{plan.findings}\n  {plan.duration}")
     progress = Progress(plan)
-    stages = commands.stages(progress)
+    stages = list_stages(progress)
     assert cfg.policy is not None
     content = {
         "dataset": fingerprint(plan.findings.root),
@@ -59,11 +60,12 @@ def settings(cfg: ImproveConfig, stages: list[Stage]) -> dict[str, object]:
     if cfg.policy_flags:
         settings["policy_flags"] = cfg.policy_flags
     return settings | {
-        "policy": resolved_name(str(cfg.policy.pretrained_path)), "size": cfg.preset,
+        "policy": resolved_name(str(cfg.policy.pretrained_path)),
+        "size": cfg.preset,
         "output_dir": str(cfg.output_dir),
         "selection_episodes": cfg.selection_episodes if cfg.selects else 0,
         "stages": [stage.name for stage in stages],
-    }  # fmt: skip
+    }
 
 
 def main() -> None:

@@ -123,9 +123,11 @@ class JudgeConfig(RunConfig):
             )
         if not self.dataset.given:
             raise FieldError(
-                "dataset.root", "", "is missing: labelled rollouts say how often the world model errs",
+                "dataset.root",
+                "",
+                "is missing: labelled rollouts say how often the world model errs",
                 "give some that it has not learnt from, or its own data with `split=validation`",
-            )  # fmt: skip
+            )
         require_at_least(self, 1, "batch_size")
         require_probability(self, "coverage")
         self._check_starts()
@@ -140,18 +142,21 @@ class JudgeConfig(RunConfig):
         require_at_least(starts, 1, "max_starts")
         if starts.branches:
             raise FieldError(
-                "starts.branches", starts.branches,
+                "starts.branches",
+                starts.branches,
                 "from the middle of episodes a policy does not succeed as often as from their starts",
                 "leave it out",
-            )  # fmt: skip
+            )
         if self.starts_given:
             with renamed("dataset", "starts"):
                 starts.validate()
         elif starts != StartFrames(max_starts=starts.max_starts):
             raise FieldError(
-                "starts.root", "", "is missing, so that imagined episodes start in the rollouts",
+                "starts.root",
+                "",
+                "is missing, so that imagined episodes start in the rollouts",
                 "choose among them by `dataset.episodes` and `split`, or give `starts.root`",
-            )  # fmt: skip
+            )
 
     def imagination(self) -> WorldModelEnv:
         """Return the world model as the environment of the policies. FieldError if it cannot be one."""
@@ -160,10 +165,14 @@ class JudgeConfig(RunConfig):
             starts, group = self.starts, "starts"
         with renamed("world_model_path", "world_model.path"), renamed("dataset", group):
             return WorldModelEnv(
-                world_model_path=self.world_model.path, dataset=starts,
-                reward=GeneralConfig(alpha=1.0), episode_length=self.episode_length,
-                done_threshold=self.done_threshold, done_frames=self.done_frames, device=self.device,
-            )  # fmt: skip
+                world_model_path=self.world_model.path,
+                dataset=starts,
+                reward=GeneralConfig(alpha=1.0),
+                episode_length=self.episode_length,
+                done_threshold=self.done_threshold,
+                done_frames=self.done_frames,
+                device=self.device,
+            )
 
 
 MAY_DIFFER = ("policies", "references", "coverage")
@@ -228,9 +237,11 @@ def read_both(
         references = read_policies(list(known), env)
     if both := sorted(judged.keys() & references.keys()):
         raise FieldError(
-            "policies", both[0], "its real success is known: it is among the references",
+            "policies",
+            both[0],
+            "its real success is known: it is among the references",
             "leave it out of one of the two",
-        )  # fmt: skip
+        )
     return references | judged, dict(zip(references, known.values(), strict=True))
 
 
@@ -275,9 +286,13 @@ def remember(judgement: Judgement, cfg: JudgeConfig, configs: Collection[str]) -
 
 
 def imagine(
-    cfg: JudgeConfig, env: WorldModelEnv, judgement: Judgement, configs: Mapping[str, PreTrainedConfig],
-    rollouts: int, claim: Claim,
-) -> None:  # fmt: skip
+    cfg: JudgeConfig,
+    env: WorldModelEnv,
+    judgement: Judgement,
+    configs: Mapping[str, PreTrainedConfig],
+    rollouts: int,
+    claim: Claim,
+) -> None:
     """Imagine the episodes of the policies that have none yet; write the results after every policy.
 
     rollouts: how many there are, and so how many starts, unless others are given.

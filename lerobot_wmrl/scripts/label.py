@@ -82,10 +82,12 @@ def require_unlabelled(cfg: LabelConfig, dataset: "LeRobotDataset") -> None:
     read = cfg.success.column if isinstance(cfg.success, ColumnRule) else None
     if SUCCESS in dataset.features and read != SUCCESS:
         raise FieldError(
-            "dataset.root", cfg.dataset.root, f"has a column {SUCCESS} already",
+            "dataset.root",
+            cfg.dataset.root,
+            f"has a column {SUCCESS} already",
             "train with it, or remove it first: "
             + edit_advice(dataset.root, "remove_feature", {"operation.feature_names": [SUCCESS]}),
-        )  # fmt: skip
+        )
     require_new("output_dir", cfg.output_dir)
 
 

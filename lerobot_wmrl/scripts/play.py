@@ -109,9 +109,11 @@ class PlayConfig(RunConfig):
             raise FieldError("world_model.path", "", "is missing", "give the action world model to drive")
         if not self.dataset.given and self.real_env is None:
             raise FieldError(
-                "dataset.root", "", "is missing: a drive begins in a frame",
+                "dataset.root",
+                "",
+                "is missing: a drive begins in a frame",
                 "give the world model's dataset, `dataset.repo_id`, or an environment, `real_env.type`",
-            )  # fmt: skip
+            )
         whole_number("port", self.port, LAST_PORT)
         require_at_least(self, 1, "export_starts")
         if self.export is not None:
@@ -124,9 +126,10 @@ class PlayConfig(RunConfig):
                 "dataset.root", "", "is missing: an exported page begins in its frames", "give a dataset"
             )
         for name, value in (
-            ("policy.path", self.policy), ("real_env.type", self.real_env),
+            ("policy.path", self.policy),
+            ("real_env.type", self.real_env),
             ("text_world_model.path", self.text_world_model.path),
-        ):  # fmt: skip
+        ):
             if value:
                 raise FieldError(
                     name, getattr(value, "type", value), "is in no exported page", "leave it out"
@@ -135,9 +138,11 @@ class PlayConfig(RunConfig):
         for package in ("onnx", "onnxscript", "onnxruntime"):
             if find_spec(package) is None:
                 raise FieldError(
-                    "export", folder, f"needs the package {package}",
+                    "export",
+                    folder,
+                    f"needs the package {package}",
                     'pip install ".[export]" in the clone of lerobot_wmrl',
-                )  # fmt: skip
+                )
 
 
 def play(cfg: PlayConfig) -> None:
@@ -155,10 +160,14 @@ def play(cfg: PlayConfig) -> None:
         renamed("text_world_model_path", "text_world_model.path"),
     ):
         env = DrivenEnv(
-            world_model_path=cfg.world_model.path, text_world_model_path=cfg.text_world_model.path,
-            episode_length=cfg.episode_length, done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
-            device=cfg.device if cfg.export is None else "cpu", **reward,
-        )  # fmt: skip
+            world_model_path=cfg.world_model.path,
+            text_world_model_path=cfg.text_world_model.path,
+            episode_length=cfg.episode_length,
+            done_threshold=cfg.done_threshold,
+            done_frames=cfg.done_frames,
+            device=cfg.device if cfg.export is None else "cpu",
+            **reward,
+        )
         world = load_world(env, cfg.dataset, cfg.policy, cfg.real_env, cfg.end_at_success)
     if cfg.export is not None:
         export(world, cfg.export, cfg.export_starts)

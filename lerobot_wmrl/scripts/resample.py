@@ -86,9 +86,11 @@ def summed_components(cfg: ResampleConfig, dataset: LeRobotDataset) -> np.ndarra
     require_at_least(cfg, 2, "every")
     if dataset.fps % cfg.every:
         raise FieldError(
-            "every", cfg.every, f"does not divide the dataset's {dataset.fps} frames a second",
+            "every",
+            cfg.every,
+            f"does not divide the dataset's {dataset.fps} frames a second",
             "choose a number that does",
-        )  # fmt: skip
+        )
     names = component_names(dataset.features[ACTION])
     for name in cfg.displacements:
         if name not in names:
@@ -98,18 +100,22 @@ def summed_components(cfg: ResampleConfig, dataset: LeRobotDataset) -> np.ndarra
     if dataset.meta.depth_keys:
         depth = ", ".join(dataset.meta.depth_keys)
         raise FieldError(
-            "dataset.root", dataset.root, f"has depth ({depth}), which is not copied",
+            "dataset.root",
+            dataset.root,
+            f"has depth ({depth}), which is not copied",
             "remove it first: "
             + edit_advice(
                 dataset.root, "remove_feature", {"operation.feature_names": [*dataset.meta.depth_keys]}
             ),
-        )  # fmt: skip
+        )
     if language := [name for name, each in dataset.features.items() if each["dtype"] == "language"]:
         raise FieldError(
-            "dataset.root", dataset.root, f"has annotations ({', '.join(language)}), which are not copied",
+            "dataset.root",
+            dataset.root,
+            f"has annotations ({', '.join(language)}), which are not copied",
             "remove them first: "
             + edit_advice(dataset.root, "remove_feature", {"operation.feature_names": language}),
-        )  # fmt: skip
+        )
     require_new("output_dir", cfg.output_dir)
     return np.isin(names, cfg.displacements)
 
@@ -125,11 +131,14 @@ def write_resampled(dataset: LeRobotDataset, cfg: ResampleConfig, summed: np.nda
         encoder = None
     with whole_folder(cfg.output_dir) as partial:
         copy = LeRobotDataset.create(
-            cfg.repo_id or f"local/{cfg.output_dir.name}", dataset.fps // cfg.every,
-            scaled_features(dataset.features, summed, cfg.every), root=partial,
-            robot_type=dataset.meta.robot_type, use_videos=bool(dataset.meta.video_keys),
+            cfg.repo_id or f"local/{cfg.output_dir.name}",
+            dataset.fps // cfg.every,
+            scaled_features(dataset.features, summed, cfg.every),
+            root=partial,
+            robot_type=dataset.meta.robot_type,
+            use_videos=bool(dataset.meta.video_keys),
             rgb_encoder=encoder,
-        )  # fmt: skip
+        )
         for episode in trange(dataset.num_episodes, unit="episode", desc="Copying"):
             for row in episode_rows(dataset, episode, copy.features, cfg.every, summed):
                 copy.add_frame(row)

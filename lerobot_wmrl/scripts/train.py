@@ -71,9 +71,11 @@ def train_policy(cfg: TrainConfig) -> None:
     config = resolve_policy(cfg)
     if isinstance(cfg.env, WorldModelEnv) and cfg.env.device not in (None, config.device):
         raise FieldError(
-            "env.device", cfg.env.device, f"the policy is on {config.device}, and the world model too",
+            "env.device",
+            cfg.env.device,
+            f"the policy is on {config.device}, and the world model too",
             "set `policy.device` instead",
-        )  # fmt: skip
+        )
     cfg.algorithm.check_policy(config)
     PartialState(cpu=config.device == "cpu", timeout=LONGEST_WAIT)
     content, done = named_content(cfg, config), finished(cfg)
@@ -146,9 +148,16 @@ def train_in(env: TensorEnv, cfg: TrainConfig, claim: Claim, policy: LoadedPolic
             steps = cfg.iterations * cfg.num_envs * rank_and_size()[1] * buffer.steps
             charge_steps(cfg.budget, cfg.output_dir, steps, env.max_episode_steps)
         train(
-            env, algorithm, pipeline, buffer, schedule, cfg.output_dir, save_pretrained, callbacks,
+            env,
+            algorithm,
+            pipeline,
+            buffer,
+            schedule,
+            cfg.output_dir,
+            save_pretrained,
+            callbacks,
             make_wandb(cfg),
-        )  # fmt: skip
+        )
 
 
 def main() -> None:

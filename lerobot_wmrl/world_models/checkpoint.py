@@ -82,14 +82,18 @@ def read_config(
         config = RewardModelConfig.from_pretrained(str(folder), cli_overrides=[f"--device={device}"])
     except FileNotFoundError as error:
         raise FieldError(
-            field, path, f"no {expected_type} there, nor on the hub ({first_line(error)})",
+            field,
+            path,
+            f"no {expected_type} there, nor on the hub ({first_line(error)})",
             "give its training's output folder, or a hub id",
-        ) from error  # fmt: skip
+        ) from error
     except (ParsingError, TypeError, KeyError) as error:
         raise FieldError(
-            field, path, f"its configuration is of an earlier version of this package ({first_line(error)})",
+            field,
+            path,
+            f"its configuration is of an earlier version of this package ({first_line(error)})",
             "train the model again",
-        ) from error  # fmt: skip
+        ) from error
     require_type(config.type, expected_type, field, path)  # one of the hub
     return config
 
@@ -98,9 +102,11 @@ def require_type(actual: Any, expected: str, field: str, path: str | Path) -> No
     """Raise FieldError unless the checkpoint at `path` is of the expected type."""
     if actual != expected:
         raise FieldError(
-            field, path, f"is a checkpoint of type {actual!r}, but {expected!r} is needed here",
+            field,
+            path,
+            f"is a checkpoint of type {actual!r}, but {expected!r} is needed here",
             "give the output folder of a training with that type",
-        )  # fmt: skip
+        )
 
 
 def config_to_continue(path: str, overrides: Sequence[str]) -> RewardModelConfig:
@@ -114,23 +120,29 @@ def config_to_continue(path: str, overrides: Sequence[str]) -> RewardModelConfig
         RewardModelConfig.from_pretrained(str(folder), revision=revision)
     except Exception as error:  # draccus, the hub and json each raise their own
         raise FieldError(
-            "model.path", path, f"no model can be loaded from it ({first_line(error)})",
+            "model.path",
+            path,
+            f"no model can be loaded from it ({first_line(error)})",
             "give the output folder of a training with this version of the package, or a hub id",
-        ) from error  # fmt: skip
+        ) from error
     try:
         config = RewardModelConfig.from_pretrained(
             str(folder), revision=revision, cli_overrides=[*UNPUBLISHED, *overrides]
         )
     except SystemExit as error:  # of argparse, which has named them
         raise FieldError(
-            "model.path", path, "its model has not all of the settings that are given beside it",
+            "model.path",
+            path,
+            "its model has not all of the settings that are given beside it",
             "leave out those that the message above names",
-        ) from error  # fmt: skip
+        ) from error
     except (ParsingError, TypeError, KeyError) as error:
         raise FieldError(
-            "model.path", path, f"cannot be trained further with {' '.join(overrides)} ({first_line(error)})",
+            "model.path",
+            path,
+            f"cannot be trained further with {' '.join(overrides)} ({first_line(error)})",
             "give other settings of this kind of model alone, or train a new one with `model.type`",
-        ) from error  # fmt: skip
+        ) from error
     config.pretrained_path, config.pretrained_revision = str(folder), revision
     return config
 
@@ -143,19 +155,24 @@ def load_model_to_continue(config: RewardModelConfig, meta: Any) -> Any:
     """
     try:
         model = get_reward_model_class(config.type).from_pretrained(
-            config.pretrained_path, revision=config.pretrained_revision, config=config, strict=True,
-            dataset_stats=meta.stats, dataset_meta=meta,
-        )  # fmt: skip
+            config.pretrained_path,
+            revision=config.pretrained_revision,
+            config=config,
+            strict=True,
+            dataset_stats=meta.stats,
+            dataset_meta=meta,
+        )
     except torch.OutOfMemoryError:
         raise
     except SafetensorError as error:
         raise unreadable_weights(config.pretrained_path, error) from error
     except RuntimeError as error:
         raise FieldError(
-            "model.path", config.pretrained_path,
+            "model.path",
+            config.pretrained_path,
             f"the weights do not fit the settings ({' '.join(str(error).split())})",
             "leave the sizes of layers as they are, or train a new model with `model.type`",
-        ) from error  # fmt: skip
+        ) from error
     return model.to(config.device)
 
 
@@ -243,20 +260,25 @@ def check_tokenizer_source(config: WorldModelConfig, untrained: bool) -> None:
     """
     if config.tokenizer_path and config.pretrained_path:
         raise FieldError(
-            "tokenizer_path", config.tokenizer_path,
+            "tokenizer_path",
+            config.tokenizer_path,
             f"the world model at {config.pretrained_path} carries the tokenizer whose codes it has learnt",
             "leave one of the two out",
-        )  # fmt: skip
+        )
     if config.tokenizer_path and config.tokenizer is not None:
         raise FieldError(
-            "tokenizer", config.tokenizer, "is that of the checkpoint at `tokenizer_path`",
+            "tokenizer",
+            config.tokenizer,
+            "is that of the checkpoint at `tokenizer_path`",
             "leave its settings out",
-        )  # fmt: skip
+        )
     if not config.tokenizer_path and (untrained or config.tokenizer is None):
         raise FieldError(
-            "tokenizer_path", config.tokenizer_path, "is missing",
+            "tokenizer_path",
+            config.tokenizer_path,
+            "is missing",
             "give the output folder of a training with type=frame_tokenizer",
-        )  # fmt: skip
+        )
 
 
 def check_same_tokenizer(model: Any, other: Any, field: str, value: object) -> None:
@@ -264,6 +286,8 @@ def check_same_tokenizer(model: Any, other: Any, field: str, value: object) -> N
     first, second = model.tokenizer.state_dict(), other.tokenizer.state_dict()
     if first.keys() != second.keys() or not all(torch.equal(first[name], second[name]) for name in first):
         raise FieldError(
-            field, value, "was trained with another tokenizer than the action world model",
+            field,
+            value,
+            "was trained with another tokenizer than the action world model",
             "train both with the same `tokenizer_path`",
-        )  # fmt: skip
+        )

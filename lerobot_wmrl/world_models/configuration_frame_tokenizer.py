@@ -65,15 +65,19 @@ class TokenizerConfig:
             raise FieldError("tokenizer.cameras", self.cameras, "give at least one camera, each once")
         if self.success and not self.context:
             raise FieldError(
-                "tokenizer.success", True,
+                "tokenizer.success",
+                True,
                 "success can depend on the episode's first frame, which tokens without `tokenizer.context` "
-                "do not show", "set `tokenizer.context` to true",
-            )  # fmt: skip
+                "do not show",
+                "set `tokenizer.context` to true",
+            )
         if self.instructions and not self.success:
             raise FieldError(
-                "tokenizer.instructions", True, "they are read where success is classified, which is off",
+                "tokenizer.instructions",
+                True,
+                "they are read where success is classified, which is off",
                 "set `tokenizer.success` to true",
-            )  # fmt: skip
+            )
         self._check_sizes()
         self._check_levels()
 
@@ -81,16 +85,18 @@ class TokenizerConfig:
         """Raise FieldError unless the coarsest scale can be normalised, and tokens fill the frame."""
         if not self.widths or min(self.widths) < 1 or self.widths[-1] % NORM_GROUPS:
             raise FieldError(
-                "tokenizer.widths", list(self.widths),
+                "tokenizer.widths",
+                list(self.widths),
                 f"must be channels from fine to coarse, the last a multiple of {NORM_GROUPS}",
                 "each further entry halves the token grid",
-            )  # fmt: skip
+            )
         if self.image_size < 1 or self.image_size % self.downsample:
             raise FieldError(
-                "tokenizer.image_size", self.image_size,
+                "tokenizer.image_size",
+                self.image_size,
                 f"must be a multiple of {self.downsample}, a token's side with "
                 f"`tokenizer.widths`={list(self.widths)}",
-            )  # fmt: skip
+            )
 
     def _check_levels(self) -> None:
         """Raise FieldError unless the quantizer is known and can have these levels."""
@@ -107,18 +113,21 @@ class TokenizerConfig:
         most = MOST_CODES[self.quantizer]
         if math.prod(levels) > most:
             raise FieldError(
-                "tokenizer.levels", levels, f"{math.prod(levels):,} codes are more than {most:,}",
+                "tokenizer.levels",
+                levels,
+                f"{math.prod(levels):,} codes are more than {most:,}",
                 "give fewer factors",
-            )  # fmt: skip
+            )
         size = levels[0]
         same_power = len(set(levels)) == 1 and not size & (size - 1) and size <= LARGEST_BINARY_FACTOR
         if self.quantizer == "lfq" and not same_power:
             raise FieldError(
-                "tokenizer.levels", levels,
+                "tokenizer.levels",
+                levels,
                 "with `tokenizer.quantizer`=lfq all factors must be the same power of two, at most "
                 f"{LARGEST_BINARY_FACTOR}",
                 "[512,512] is 18 bits in two factors",
-            )  # fmt: skip
+            )
 
     @property
     def downsample(self) -> int:

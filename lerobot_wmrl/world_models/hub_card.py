@@ -34,9 +34,12 @@ model = get_reward_model_class("{type}").from_pretrained("{repo_id}")
 def card_metadata(config: Any, *tags: str, **more: Any) -> ModelCardData:
     """Return the metadata of the card of a model with this configuration, as LeRobot's own cards have it."""
     return ModelCardData(
-        license=config.license or "apache-2.0", library_name="lerobot", pipeline_tag="robotics",
-        tags=sorted({*(config.tags or []), "robotics", "lerobot", *tags, config.type}), **more,
-    )  # fmt: skip
+        license=config.license or "apache-2.0",
+        library_name="lerobot",
+        pipeline_tag="robotics",
+        tags=sorted({*(config.tags or []), "robotics", "lerobot", *tags, config.type}),
+        **more,
+    )
 
 
 class HubCard:
@@ -68,11 +71,14 @@ class HubCard:
         metadata = card_metadata(config, "reward-model", datasets=dataset_repo_id)
         return ModelCard(
             CARD.format(
-                metadata=metadata.to_yaml(), name=config.type, summary=self.summary, type=config.type,
+                metadata=metadata.to_yaml(),
+                name=config.type,
+                summary=self.summary,
+                type=config.type,
                 dataset=f"`{dataset_repo_id}`" if dataset_repo_id else "a dataset that is not published",
                 repo_id=config.repo_id,
             )
-        )  # fmt: skip
+        )
 
 
 EVALUATION: Final = "evaluation"

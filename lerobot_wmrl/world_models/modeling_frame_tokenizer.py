@@ -76,8 +76,11 @@ def with_frame_sizes(tokenizer: TokenizerConfig, features: dict[str, Any]) -> To
         if (height, width) != (side, side):
             logging.info(
                 "%s: frames of %d x %d (height x width) are stretched to `tokenizer.image_size`=%d",
-                key, height, width, side,
-            )  # fmt: skip
+                key,
+                height,
+                width,
+                side,
+            )
     return replace(tokenizer, frame_sizes=sizes)
 
 
@@ -159,9 +162,11 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
             return self._stack(batch, "reference")
         if self.config.tokenizer.context:
             raise FieldError(
-                "tokenizer.context", True, f"the batch lacks {missing}, the first frames of the episodes",
+                "tokenizer.context",
+                True,
+                f"the batch lacks {missing}, the first frames of the episodes",
                 "train with lerobot-wmrl-train-world-model, which adds them",
-            )  # fmt: skip
+            )
         return None
 
     def _perceptual_loss(self, device: torch.device) -> ImageLoss | None:

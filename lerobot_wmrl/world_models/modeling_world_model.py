@@ -277,9 +277,11 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         embodiment = self.config.embodiment
         if not embodiment.action_low:
             raise FieldError(
-                "world_model_path", self.config.pretrained_path, "does not say in which range actions are",
+                "world_model_path",
+                self.config.pretrained_path,
+                "does not say in which range actions are",
                 "train it with this version of the package",
-            )  # fmt: skip
+            )
         ends = embodiment.action_low, embodiment.action_high
         low, high = (torch.tensor(end, device=self.device) for end in ends)
         return low, high
@@ -341,9 +343,13 @@ class TextWorldModelRewardModel(WorldModelRewardModel):
     )
 
     def __init__(
-        self, config: TextWorldModelConfig, *, dataset_meta: Any = None, t5: FrozenT5 | None = None,
+        self,
+        config: TextWorldModelConfig,
+        *,
+        dataset_meta: Any = None,
+        t5: FrozenT5 | None = None,
         **kwargs: Any,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(config, dataset_meta=dataset_meta, **kwargs)
         if config.text_encoder is not None:
             t5 = t5 or FrozenT5.load(config.text_encoder)
@@ -360,9 +366,11 @@ class TextWorldModelRewardModel(WorldModelRewardModel):
         config = config or RewardModelConfig.from_pretrained(pretrained_name_or_path, **kwargs)
         if config.text_encoder not in (None, CHECKPOINT_FOLDER):
             raise FieldError(
-                "text_encoder", config.text_encoder, "a trained model keeps the text encoder that it has",
+                "text_encoder",
+                config.text_encoder,
+                "a trained model keeps the text encoder that it has",
                 "leave it out, or train a new model with `model.type`",
-            )  # fmt: skip
+            )
         if config.text_encoder is not None:
             kwargs["t5"] = FrozenT5.load_carried(pretrained_name_or_path, kwargs.get("revision"))
         return super().from_pretrained(pretrained_name_or_path, config=config, **kwargs)

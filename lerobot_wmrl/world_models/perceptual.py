@@ -46,11 +46,13 @@ def require_backbone(net: str, field: str, value: object, otherwise: str) -> Non
     path, (name, constructor) = backbone_path(net), CONSTRUCTORS[net]
     if not path.is_file():
         raise FieldError(
-            field, value, f"LPIPS needs the {name} of torchvision, and {path} is missing",
+            field,
+            value,
+            f"LPIPS needs the {name} of torchvision, and {path} is missing",
             f'where there is a network run python -c "import torchvision; torchvision.models.{constructor}('
             "weights='IMAGENET1K_V1')\" and copy the file there (TORCH_HOME says where the cache is), or set "
             f"`{field}` to {otherwise}",
-        )  # fmt: skip
+        )
 
 
 @cache

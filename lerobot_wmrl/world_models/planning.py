@@ -28,9 +28,18 @@ def interpolate_knots(knots: Tensor, horizon: int) -> Tensor:
 
 
 def plan_knots(
-    objective: Objective, mean: Tensor, std: Tensor, low: Tensor, high: Tensor, *,
-    horizon: int, samples: int, elites: int, iterations: int, generator: torch.Generator,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    objective: Objective,
+    mean: Tensor,
+    std: Tensor,
+    low: Tensor,
+    high: Tensor,
+    *,
+    horizon: int,
+    samples: int,
+    elites: int,
+    iterations: int,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
     """Search the best knots by the cross-entropy method, B searches at once.
 
     The mean that a search begins at, within the bounds, and that of each iteration but the last, is among
@@ -87,9 +96,17 @@ class Planner:
     """
 
     def __init__(
-        self, model: Any, text_model: Any, settings: PlannerSettings, done_frames: int, averaged: bool,
-        low: Tensor, high: Tensor, seed: int, searched: Tensor | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        model: Any,
+        text_model: Any,
+        settings: PlannerSettings,
+        done_frames: int,
+        averaged: bool,
+        low: Tensor,
+        high: Tensor,
+        seed: int,
+        searched: Tensor | None = None,
+    ) -> None:
         self.model, self.text_model = model, text_model
         self.settings, self.done_frames, self.averaged = settings, done_frames, averaged
         self.low, self.high, self.seed = low, high, seed
@@ -104,9 +121,12 @@ class Planner:
 
     @torch.no_grad()
     def plan(
-        self, frames: Frames, instructions: Sequence[str], proposed: Tensor | None = None,
+        self,
+        frames: Frames,
+        instructions: Sequence[str],
+        proposed: Tensor | None = None,
         steps_left: int | None = None,
-    ) -> Tensor:  # fmt: skip
+    ) -> Tensor:
         """Plan from these frames on.
 
         Args:
@@ -125,9 +145,17 @@ class Planner:
 
         def search(objective: Objective, mean: Tensor, low: Tensor, high: Tensor) -> Tensor:
             best, average = plan_knots(
-                objective, mean, self.std, low, high, horizon=settings.horizon, samples=settings.samples,
-                elites=settings.elites, iterations=settings.iterations, generator=self.generator,
-            )  # fmt: skip
+                objective,
+                mean,
+                self.std,
+                low,
+                high,
+                horizon=settings.horizon,
+                samples=settings.samples,
+                elites=settings.elites,
+                iterations=settings.iterations,
+                generator=self.generator,
+            )
             return average if self.averaged else best
 
         if proposed is not None:

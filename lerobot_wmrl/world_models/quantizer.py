@@ -65,9 +65,12 @@ class LookupFreeQuantizer(nn.Module):
         super().__init__()
         self.codebook = BinaryCodeBook(levels)
         self.lfq = LFQ(
-            codebook_size=levels[0], num_codebooks=len(levels), keep_num_codebooks_dim=True,
-            entropy_loss_weight=ENTROPY_WEIGHT, commitment_loss_weight=COMMITMENT_WEIGHT,
-        )  # fmt: skip
+            codebook_size=levels[0],
+            num_codebooks=len(levels),
+            keep_num_codebooks_dim=True,
+            entropy_loss_weight=ENTROPY_WEIGHT,
+            commitment_loss_weight=COMMITMENT_WEIGHT,
+        )
 
     def forward(self, vectors: Tensor) -> Quantized:
         """Vectors (F, K, g, g) → their values and tokens; in training also the loss (eqs. 4, 5) in nats."""

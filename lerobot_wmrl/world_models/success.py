@@ -141,9 +141,13 @@ class SuccessClassifier(nn.Module):
         self.encoders = nn.ModuleList(PairEncoder() for _ in range(cameras))
         encoded = cameras * (4 * WIDTH + GRID_CHANNELS * GRID**2)
         self.mix = nn.Sequential(
-            nn.Linear(encoded, HIDDEN), nn.LayerNorm(HIDDEN), nn.SiLU(), nn.Dropout(DROPOUT),
-            nn.Linear(HIDDEN, HIDDEN), nn.SiLU(),
-        )  # fmt: skip
+            nn.Linear(encoded, HIDDEN),
+            nn.LayerNorm(HIDDEN),
+            nn.SiLU(),
+            nn.Dropout(DROPOUT),
+            nn.Linear(HIDDEN, HIDDEN),
+            nn.SiLU(),
+        )
         self.head = SuccessHead(cameras)
         self.instructions = InstructionReader() if instructions else None
 

@@ -187,9 +187,14 @@ class ByteTextEncoder(TextEncoder):
         super().__init__()
         self.tokenizer = ByT5Tokenizer()
         config = T5Config(
-            vocab_size=len(self.tokenizer), d_model=64, d_kv=16, d_ff=256, num_layers=2, num_heads=4,
+            vocab_size=len(self.tokenizer),
+            d_model=64,
+            d_kv=16,
+            d_ff=256,
+            num_layers=2,
+            num_heads=4,
             dropout_rate=0.0,
-        )  # fmt: skip
+        )
         self.encoder = T5EncoderModel(config)
         self.project = nn.Linear(config.d_model, width)
 

@@ -64,9 +64,12 @@ def build_model(config: RewardModelConfig, table: EpisodeTable, output_dir: Path
 
 
 def train(
-    model: PreTrainedRewardModel, sampler: Callable[[int], Any], settings: TrainingSettings,
-    save_config: Callable[[Path], None], wandb: Any = None,
-) -> None:  # fmt: skip
+    model: PreTrainedRewardModel,
+    sampler: Callable[[int], Any],
+    settings: TrainingSettings,
+    save_config: Callable[[Path], None],
+    wandb: Any = None,
+) -> None:
     """Train from the last checkpoint in `output_dir` to `steps`.
 
     Args:

@@ -51,9 +51,11 @@ def decide_on_instructions(config: RewardModelConfig, table: EpisodeTable, data:
     problem = reads and instruction_problem(text for each in tables for text in each.instructions)
     if problem and asked:
         raise FieldError(
-            "tokenizer.instructions", True, problem,
+            "tokenizer.instructions",
+            True,
+            problem,
             "or set it to false: success then depends on pictures alone",
-        )  # fmt: skip
+        )
     if problem:
         logging.warning("success is told without the instructions, one of which cannot be read: %s", problem)
     config.tokenizer = replace(config.tokenizer, instructions=reads and not problem)
@@ -64,9 +66,11 @@ def require_golden(table: EpisodeTable, episodes: np.ndarray) -> np.ndarray:
     if episodes.any():
         return episodes
     raise FieldError(
-        "dataset.root", table.dataset.root, "has no successful demonstration",
+        "dataset.root",
+        table.dataset.root,
+        "has no successful demonstration",
         "the text world model needs some: record them, or add labels (lerobot-wmrl-label)",
-    )  # fmt: skip
+    )
 
 
 def golden_episodes(table: EpisodeTable) -> np.ndarray:
@@ -103,9 +107,11 @@ def make_sampler(
     episodes = table.training(chosen)
     if not episodes.any():
         raise FieldError(
-            "dataset.root", table.dataset.root, "has no episode to train on",
+            "dataset.root",
+            table.dataset.root,
+            "has no episode to train on",
             "record some first, or choose others with `dataset.episodes`: every twentieth is held out",
-        )  # fmt: skip
+        )
     config: Any = model.config
     frames = cached_frames(table.dataset, config.tokenizer.camera_keys, config.tokenizer.image_size)
     read = table.among(chosen) if measured else episodes
@@ -121,12 +127,6 @@ def make_sampler(
         )
     check_episode_lengths(table.dataset.root, int(episodes.sum()), int(table.length[episodes].sum()))
     require_readable(model, table, read)
-    if isinstance(config, ActionWorldModelConfig) and not table.has_labels:
-        logging.warning(
-            "dataset.root=%s: has neither next.success nor next.done: the model cannot learn from it what "
-            "success is. Check it afterwards (lerobot-wmrl-eval-world-model)",
-            table.dataset.root,
-        )
     return make_clip_sampler(model, table, episodes.nonzero()[0], batch_size, seed)
 
 
@@ -135,10 +135,12 @@ def require_success_labels(table: EpisodeTable, episodes: np.ndarray) -> None:
     shows the success that its labels tell of."""
     if not table.has_labels:
         raise FieldError(
-            "tokenizer.success", True,
+            "tokenizer.success",
+            True,
             f"{table.dataset.root} has neither next.success nor next.done, so its frames cannot be told "
-            "apart", "label its episodes, or leave `tokenizer.success` out",
-        )  # fmt: skip
+            "apart",
+            "label its episodes, or leave `tokenizer.success` out",
+        )
     if table.success[episodes].any():
         require_shown(table, episodes.nonzero()[0])
 
@@ -172,24 +174,7 @@ def make_clip_sampler(
 ) -> ClipSampler:
     """Make a sampler of clips from these episodes, with what else the model looks at or predicts."""
     config, tokenizer, dataset = model.config, model.tokenizer, table.dataset
-    if (
-        config.predicts_success
-        and not config.reads_instructions
-        and count_tasks([table.subset(episodes)]) > 1
-    ):
-        logging.warning(
-            "%s: has several tasks, and success is told without the instruction: what one task asks for "
-            "counts in another too. A tokenizer with --model.tokenizer.instructions=true reads it",
-            dataset.root,
-        )
-    longer, longest = table.length[episodes] > config.clip_length, int(table.length[episodes].max())
-    if 2 * longer.sum() > len(episodes) and not config.context_channels:
-        logging.warning(
-            "%s: %d of %d episodes are longer than the clips that are learnt from, clip_length=%d frames "
-            "(%.1f s): success is learnt up to there alone. --model.clip_length=%d holds the longest",
-            dataset.root, longer.sum(), len(episodes), config.clip_length, config.clip_length / dataset.fps,
-            longest,
-        )  # fmt: skip
+    warn_of_success(config, table, episodes)
     cameras, rows = config.tokenizer.camera_keys, table.row_numbers(episodes)
     depth = cached_depth(dataset, cameras, tokenizer.grid) if config.depth else None
     if depth is not None:
@@ -204,9 +189,48 @@ def make_clip_sampler(
     if features is not None:
         features.fill(rows)
     return ClipSampler(
-        table, tokens, episodes, config.clip_length, config.from_start, batch_size, seed, config.device,
-        depth=depth, context=context, features=features,
-    )  # fmt: skip
+        table,
+        tokens,
+        episodes,
+        config.clip_length,
+        config.from_start,
+        batch_size,
+        seed,
+        config.device,
+        depth=depth,
+        context=context,
+        features=features,
+    )
+
+
+def warn_of_success(config: Any, table: EpisodeTable, episodes: np.ndarray) -> None:
+    """Warn where a world model would not learn from these episodes what success is."""
+    root, fps = table.dataset.root, table.dataset.fps
+    if isinstance(config, ActionWorldModelConfig) and not table.has_labels:
+        logging.warning(
+            "dataset.root=%s: has neither next.success nor next.done: the model cannot learn from it what "
+            "success is. Check it afterwards (lerobot-wmrl-eval-world-model)",
+            root,
+        )
+    untold = config.predicts_success and not config.reads_instructions
+    if untold and count_tasks([table.subset(episodes)]) > 1:
+        logging.warning(
+            "%s: has several tasks, and success is told without the instruction: what one task asks for "
+            "counts in another too. A tokenizer with --model.tokenizer.instructions=true reads it",
+            root,
+        )
+    longer, longest = table.length[episodes] > config.clip_length, int(table.length[episodes].max())
+    if 2 * longer.sum() > len(episodes) and not config.context_channels:
+        logging.warning(
+            "%s: %d of %d episodes are longer than the clips that are learnt from, clip_length=%d frames "
+            "(%.1f s): success is learnt up to there alone. --model.clip_length=%d holds the longest",
+            root,
+            longer.sum(),
+            len(episodes),
+            config.clip_length,
+            config.clip_length / fps,
+            longest,
+        )
 
 
 def warn_of_far(depth: LazyRows, table: EpisodeTable, episodes: np.ndarray) -> None:
@@ -215,8 +239,10 @@ def warn_of_far(depth: LazyRows, table: EpisodeTable, episodes: np.ndarray) -> N
     if beyond > FAR_SHARE:
         logging.warning(
             "%s: %.0f %% of the depth is beyond %.1f m, and is learnt as if it were there",
-            table.dataset.root, 100 * beyond, FAR,
-        )  # fmt: skip
+            table.dataset.root,
+            100 * beyond,
+            FAR,
+        )
 
 
 def make_joint_sampler(

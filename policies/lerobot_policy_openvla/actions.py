@@ -106,10 +106,13 @@ def action_statistics(actions: np.ndarray, names: Sequence[str]) -> dict[str, li
     """Compute the statistics of actions (N, A). A gripper within [-1, 1] is masked out: it stays as it is."""
     bounded = np.abs(actions).max(axis=0) <= 1
     statistics = {
-        "mean": actions.mean(axis=0), "std": actions.std(axis=0), "min": actions.min(axis=0),
-        "max": actions.max(axis=0), "q01": np.quantile(actions, 0.01, axis=0),
+        "mean": actions.mean(axis=0),
+        "std": actions.std(axis=0),
+        "min": actions.min(axis=0),
+        "max": actions.max(axis=0),
+        "q01": np.quantile(actions, 0.01, axis=0),
         "q99": np.quantile(actions, 0.99, axis=0),
-    }  # fmt: skip
+    }
     mask = [not (GRIPPER in name.lower() and inside) for name, inside in zip(names, bounded, strict=True)]
     return {**{name: value.tolist() for name, value in statistics.items()}, "mask": mask}
 

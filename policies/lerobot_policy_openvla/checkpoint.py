@@ -31,10 +31,17 @@ ORIGINAL_CONFIG_FILE: Final = "openvla_config.json"
 STATISTICS_FILE: Final = "dataset_statistics.json"
 TOKENIZER_FILE: Final = "tokenizer.json"
 COMPANIONS: Final = (
-    TOKENIZER_FILE, "tokenizer.model", "tokenizer_config.json", "special_tokens_map.json",
-    "added_tokens.json", "preprocessor_config.json", "processor_config.json", "generation_config.json",
-    STATISTICS_FILE, VIT_FILE,
-)  # fmt: skip
+    TOKENIZER_FILE,
+    "tokenizer.model",
+    "tokenizer_config.json",
+    "special_tokens_map.json",
+    "added_tokens.json",
+    "preprocessor_config.json",
+    "processor_config.json",
+    "generation_config.json",
+    STATISTICS_FILE,
+    VIT_FILE,
+)
 """Small files beside the weights, kept as they are."""
 
 RELEASE: Final = "openvla/openvla-7b"
@@ -42,8 +49,10 @@ RELEASE: Final = "openvla/openvla-7b"
 
 VIT_IDS: Final = {DINO: "vit_large_patch14_reg4_dinov2.lvd142m", SIGLIP: "vit_so400m_patch14_siglip_224"}
 SUPPORTED: Final = {
-    "image_resize_strategy": "resize-naive", "use_fused_vision_backbone": True, "n_action_bins": BINS,
-}  # fmt: skip
+    "image_resize_strategy": "resize-naive",
+    "use_fused_vision_backbone": True,
+    "n_action_bins": BINS,
+}
 RENAMED: Final = (".gamma", ".scale_factor")
 """LayerScale's parameter: timm's name, which some fine-tuned checkpoints have, and OpenVLA's."""
 
@@ -238,21 +247,34 @@ def original_config(sizes: Sizes) -> dict[str, Any]:
     """Return OpenVLA's `config.json` for a model that never had one."""
     llama = sizes.llama
     text = {
-        "model_type": "llama", "pad_token_id": llama.tokenizer_size, "vocab_size": llama.vocab_size,
-        "hidden_size": llama.width, "intermediate_size": llama.mlp_size, "num_hidden_layers": llama.depth,
-        "num_attention_heads": llama.heads, "num_key_value_heads": llama.kv_heads,
-        "rms_norm_eps": llama.norm_eps, "rope_theta": llama.rope_theta,
+        "model_type": "llama",
+        "pad_token_id": llama.tokenizer_size,
+        "vocab_size": llama.vocab_size,
+        "hidden_size": llama.width,
+        "intermediate_size": llama.mlp_size,
+        "num_hidden_layers": llama.depth,
+        "num_attention_heads": llama.heads,
+        "num_key_value_heads": llama.kv_heads,
+        "rms_norm_eps": llama.norm_eps,
+        "rope_theta": llama.rope_theta,
         "max_position_embeddings": llama.max_positions,
-    }  # fmt: skip
+    }
     return {
-        "architectures": ["OpenVLAForActionPrediction"], "model_type": "openvla",
-        "arch_specifier": "no-align+fused-gelu-mlp", "llm_backbone_id": "llama2-7b-pure",
-        "vision_backbone_id": "dinosiglip-vit-so-224px", "hf_llm_id": "meta-llama/Llama-2-7b-hf",
-        "timm_model_ids": list(VIT_IDS.values()), "timm_override_act_layers": [None, None],
-        "image_sizes": [sizes.image_size] * 2, "llm_max_length": llama.max_positions,
-        "pad_to_multiple_of": llama.extra_ids, "pad_token_id": llama.tokenizer_size,
-        "text_config": text, **SUPPORTED,
-    }  # fmt: skip
+        "architectures": ["OpenVLAForActionPrediction"],
+        "model_type": "openvla",
+        "arch_specifier": "no-align+fused-gelu-mlp",
+        "llm_backbone_id": "llama2-7b-pure",
+        "vision_backbone_id": "dinosiglip-vit-so-224px",
+        "hf_llm_id": "meta-llama/Llama-2-7b-hf",
+        "timm_model_ids": list(VIT_IDS.values()),
+        "timm_override_act_layers": [None, None],
+        "image_sizes": [sizes.image_size] * 2,
+        "llm_max_length": llama.max_positions,
+        "pad_to_multiple_of": llama.extra_ids,
+        "pad_token_id": llama.tokenizer_size,
+        "text_config": text,
+        **SUPPORTED,
+    }
 
 
 def vit_overrides(sizes: Sizes) -> dict[str, Any]:

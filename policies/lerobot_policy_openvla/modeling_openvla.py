@@ -78,9 +78,13 @@ class OpenVLAPolicy(PreTrainedPolicy):
     name = "openvla"
 
     def __init__(
-        self, config: OpenVLAConfig, files: Files | None = None, dataset_meta: Any = None,
-        empty: bool = False, **_: Any,
-    ) -> None:  # fmt: skip
+        self,
+        config: OpenVLAConfig,
+        files: Files | None = None,
+        dataset_meta: Any = None,
+        empty: bool = False,
+        **_: Any,
+    ) -> None:
         super().__init__(config)
         if dataset_meta is not None:
             adopt_statistics(config, dataset_meta)
@@ -101,9 +105,14 @@ class OpenVLAPolicy(PreTrainedPolicy):
 
     @classmethod
     def from_openvla(
-        cls, source: str | Path, *, unnorm_key: str | None = None, device: str = "cpu", dtype: str = "auto",
+        cls,
+        source: str | Path,
+        *,
+        unnorm_key: str | None = None,
+        device: str = "cpu",
+        dtype: str = "auto",
         as_stored: bool = False,
-    ) -> Self:  # fmt: skip
+    ) -> Self:
         """Load a checkpoint in OpenVLA's own format.
 
         Args:
@@ -121,9 +130,15 @@ class OpenVLAPolicy(PreTrainedPolicy):
 
     @classmethod
     def from_pretrained(
-        cls, pretrained_name_or_path: str | Path, *, config: PreTrainedConfig | None = None,
-        revision: str | None = None, dataset_meta: Any = None, as_stored: bool = False, **_: Any,
-    ) -> Self:  # fmt: skip
+        cls,
+        pretrained_name_or_path: str | Path,
+        *,
+        config: PreTrainedConfig | None = None,
+        revision: str | None = None,
+        dataset_meta: Any = None,
+        as_stored: bool = False,
+        **_: Any,
+    ) -> Self:
         """Load a checkpoint in LeRobot's format, in evaluation mode; every weight must be there.
 
         Other keywords of LeRobot's method are accepted and ignored.

@@ -64,9 +64,11 @@ class WmMpcConfig(PlannerSettings, SingleStepConfig):
             raise FieldError("world_model_path", "", "is missing", "give the action world model to plan in")
         if self.objective == "goal" and not self.text_world_model_path:
             raise FieldError(
-                "text_world_model_path", "", "the objective goal needs a text world model for goal frames",
+                "text_world_model_path",
+                "",
+                "the objective goal needs a text world model for goal frames",
                 "give one, or set `objective` to success",
-            )  # fmt: skip
+            )
 
     def get_optimizer_preset(self) -> None:
         """Return None: nothing is trained."""

@@ -37,14 +37,18 @@ class WmMpcPolicy(PreTrainedPolicy):
             check_same_tokenizer(model, text_model, "text_world_model_path", config.text_world_model_path)
         elif model.config.learnt_successes == 0:
             raise FieldError(
-                "world_model_path", config.world_model_path, "has learnt from no successful episode",
+                "world_model_path",
+                config.world_model_path,
+                "has learnt from no successful episode",
                 "train it on a dataset with successes, or set `objective` to goal",
-            )  # fmt: skip
+            )
         if model.config.depth:
             raise FieldError(
-                "world_model_path", config.world_model_path, "looks at depth, which environments do not show",
+                "world_model_path",
+                config.world_model_path,
+                "looks at depth, which environments do not show",
                 "plan in one without `dynamics.depth`",
-            )  # fmt: skip
+            )
         low, high = model.action_range()
         self.planner = Planner(
             model,
@@ -112,10 +116,11 @@ class WmMpcPolicy(PreTrainedPolicy):
         if state is None or state.shape[-1] != size:
             shown = "is missing" if state is None else f"has {state.shape[-1]} components"
             raise FieldError(
-                "world_model_path", self.config.world_model_path,
+                "world_model_path",
+                self.config.world_model_path,
                 f"has learnt a state of {size} components, and {OBS_STATE} {shown}",
                 "plan where the world model's dataset was recorded, or train one without a state",
-            )  # fmt: skip
+            )
         return state
 
 

@@ -80,10 +80,13 @@ class ImaginedRobot(Robot):
         """Load the world model and begin the first episode."""
         config = self.config
         env = DrivenEnv(
-            world_model_path=config.world_model_path, dataset=config.dataset,
-            episode_length=LONGEST, done_threshold=config.done_threshold, done_frames=config.done_frames,
+            world_model_path=config.world_model_path,
+            dataset=config.dataset,
+            episode_length=LONGEST,
+            done_threshold=config.done_threshold,
+            done_frames=config.done_frames,
             device=config.device,
-        )  # fmt: skip
+        )
         models = load_world_models(env, env.device)
         self.env = make_env_at(read_start_images(config.dataset, models.model.config), models, env, 1)
         self.keys = EpisodeKeys()
@@ -132,9 +135,11 @@ class ImaginedRobot(Robot):
             components = self._displaced(components)
         if missing := [name for name in names if name not in components]:
             raise FieldError(
-                "teleop.type", ", ".join(action), f"the world model's actions need {', '.join(missing)} too",
+                "teleop.type",
+                ", ".join(action),
+                f"the world model's actions need {', '.join(missing)} too",
                 f"use a teleoperator whose actions are {', '.join(names)}, or keyboard_ee or gamepad",
-            )  # fmt: skip
+            )
         wanted = torch.tensor([[components[name] for name in names]], dtype=torch.float32)
         self.last = wanted.clamp(self.env.action_low.cpu(), self.env.action_high.cpu())
         if not self.succeeded:
@@ -174,9 +179,11 @@ class ImaginedRobot(Robot):
             component = next((name for name in candidates if name in names), None)
             if component is None:
                 raise FieldError(
-                    "teleop.type", key, f"the world model's actions have no {' or '.join(candidates)}",
+                    "teleop.type",
+                    key,
+                    f"the world model's actions have no {' or '.join(candidates)}",
                     f"use a teleoperator whose actions are {', '.join(names)}",
-                )  # fmt: skip
+                )
             action[component] += sent.get(key, 0.0) * (high[component] - low[component]) / 2
         if GRIPPER in names:
             gripper = {0.0: low[GRIPPER], 2.0: high[GRIPPER]}

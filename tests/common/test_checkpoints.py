@@ -50,9 +50,18 @@ def test_checkpoints_are_named_and_due_as_lerobots() -> None:
     assert [step for step in range(1, 8) if should_save_checkpoint(step, 3, 7)] == [3, 6, 7]
 
 
-@pytest.mark.parametrize(("name", "on_hub"), [
-    ("user/model", True), ("outputs-lab/model", True), ("gpt2", True), ("outputs/model", False),
-    ("runs/a/model", False), ("./model", False), ("/models/a", False), ("../model", False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "on_hub"),
+    [
+        ("user/model", True),
+        ("outputs-lab/model", True),
+        ("gpt2", True),
+        ("outputs/model", False),
+        ("runs/a/model", False),
+        ("./model", False),
+        ("/models/a", False),
+        ("../model", False),
+    ],
+)
 def test_names_of_the_hub_have_one_owner_and_are_not_where_commands_write(name: str, on_hub: bool) -> None:
     assert may_be_on_hub(name) == on_hub

@@ -144,14 +144,17 @@ def test_what_cannot_be_parsed_is_said_in_one_line(
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(("command", "flags", "added"), [
-    (RecordConfig, ["--env.image_size=33"], ["--env.type=wmrl_maniskill"]),
-    (TrainConfig, ["--algorithm.policy_lr=1e-4"], ["--algorithm.type=ppo"]),
-    (TrainConfig, ["--env.type=world_model", "--env.reward.alpha=1"], ["--env.reward.type=general"]),
-    (TrainConfig, ["--env.type=world_model", "--env.reward.type=embedding", "--env.reward.alpha=1"], []),
-    (TrainConfig, ["--real_env.episode_length=9", "--policy.path=x", "--policy.device=cpu"], []),
-    (TrainConfig, ["--config_path=user/policy", "--algorithm.policy_lr=1e-4"], []),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("command", "flags", "added"),
+    [
+        (RecordConfig, ["--env.image_size=33"], ["--env.type=wmrl_maniskill"]),
+        (TrainConfig, ["--algorithm.policy_lr=1e-4"], ["--algorithm.type=ppo"]),
+        (TrainConfig, ["--env.type=world_model", "--env.reward.alpha=1"], ["--env.reward.type=general"]),
+        (TrainConfig, ["--env.type=world_model", "--env.reward.type=embedding", "--env.reward.alpha=1"], []),
+        (TrainConfig, ["--real_env.episode_length=9", "--policy.path=x", "--policy.device=cpu"], []),
+        (TrainConfig, ["--config_path=user/policy", "--algorithm.policy_lr=1e-4"], []),
+    ],
+)
 def test_a_default_type_need_not_be_typed(
     command: type[RunConfig], flags: list[str], added: list[str]
 ) -> None:
@@ -178,15 +181,24 @@ def test_what_is_said_of_a_checkpoint_is_noted_where_flags_are_parsed(
 def test_flags_may_be_written_with_a_space() -> None:
     argv = ["--preset", "tiny", "--resume", "--a.b=1", "--c", "-1", "--help", "-h", "--d=x y"]
     assert with_equals_signs(argv) == [
-        "--preset=tiny", "--resume", "--a.b=1", "--c=-1", "--help", "-h", "--d=x y",
-    ]  # fmt: skip
+        "--preset=tiny",
+        "--resume",
+        "--a.b=1",
+        "--c=-1",
+        "--help",
+        "-h",
+        "--d=x y",
+    ]
 
 
 def test_the_home_folder_is_expanded_in_flags() -> None:
     home = str(Path.home())
     assert with_home(["--a=~/x", "--b=~", "--c=x/~/y", "--resume"]) == [
-        f"--a={home}/x", "--b=~", "--c=x/~/y", "--resume",
-    ]  # fmt: skip
+        f"--a={home}/x",
+        "--b=~",
+        "--c=x/~/y",
+        "--resume",
+    ]
 
 
 def test_ctrl_c_ends_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -208,10 +220,23 @@ def test_a_setting_that_another_version_lacks_is_off_there():
     assert different_settings({"real": None}, {"real": {"type": "pusht"}}, ()) == ["real.type None → 'pusht'"]
 
 
-@pytest.mark.parametrize("typed", [
-    "2024-01-15", "2024_01_15", "0123", "1.10", "1e3", "a #b", "yes", "a: b", "plain", "push,pull", "[a",
-    "12:30",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "typed",
+    [
+        "2024-01-15",
+        "2024_01_15",
+        "0123",
+        "1.10",
+        "1e3",
+        "a #b",
+        "yes",
+        "a: b",
+        "plain",
+        "push,pull",
+        "[a",
+        "12:30",
+    ],
+)
 def test_texts_stay_as_they_are_typed(typed: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """YAML makes dates, numbers and truth values of them."""
     flags = [f"--{name}={typed}" for name in ("folder", "text", "optional")]

@@ -17,11 +17,41 @@ class Texts:
     numbers: list[int] | None = None
 
 
-@pytest.mark.parametrize("text", [
-    "outputs/push, a/policy", "it's", 'a "b"', "'a'", '"a"', "a [b]", "]", "{a: b}", "a: b", "a:", "b=c",
-    " a ", "", "#a", "a #b", "- a", "*a", "!include a", "=", "null", "true", "12", "1e-4", "2026-01-01",
-    "ä😀, b", "a\nb", "\\", "2024_01_15", "1.10", "0123",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "text",
+    [
+        "outputs/push, a/policy",
+        "it's",
+        'a "b"',
+        "'a'",
+        '"a"',
+        "a [b]",
+        "]",
+        "{a: b}",
+        "a: b",
+        "a:",
+        "b=c",
+        " a ",
+        "",
+        "#a",
+        "a #b",
+        "- a",
+        "*a",
+        "!include a",
+        "=",
+        "null",
+        "true",
+        "12",
+        "1e-4",
+        "2026-01-01",
+        "ä😀, b",
+        "a\nb",
+        "\\",
+        "2024_01_15",
+        "1.10",
+        "0123",
+    ],
+)
 def test_texts_and_lists_are_parsed_as_they_were_written(text: str) -> None:
     texts = [text, "outputs/b", text]
     flags = format_flags({"texts": texts, "numbers": [3, -1]})
@@ -34,8 +64,12 @@ def test_texts_and_lists_are_parsed_as_they_were_written(text: str) -> None:
 def test_lerobot_gets_checkpoints_and_plain_texts_without_quotation_marks() -> None:
     flags = {"policy.path": "1.10", "config_path": "12", "dataset.root": "1.10", "task": "push it", "n": 3}
     assert format_lerobot_flags(flags) == [
-        "--policy.path=1.10", "--config_path=12", '--dataset.root="1.10"', "--task=push it", "--n=3"
-    ]  # fmt: skip
+        "--policy.path=1.10",
+        "--config_path=12",
+        '--dataset.root="1.10"',
+        "--task=push it",
+        "--n=3",
+    ]
 
 
 def test_a_flag_is_one_word_of_a_shell() -> None:

@@ -11,10 +11,13 @@ from lerobot.scripts.lerobot_edit_dataset import EditDatasetConfig
 from lerobot_wmrl.common.lerobot_commands import edit_advice
 
 
-@pytest.mark.parametrize(("operation", "setting", "value"), [
-    ("remove_feature", "feature_names", ["next.success", "observation.depth"]),
-    ("delete_episodes", "episode_indices", [3]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("operation", "setting", "value"),
+    [
+        ("remove_feature", "feature_names", ["next.success", "observation.depth"]),
+        ("delete_episodes", "episode_indices", [3]),
+    ],
+)
 def test_advice_to_edit_a_dataset_is_a_whole_command(operation: str, setting: str, value: list[Any]) -> None:
     program, *flags = shlex.split(edit_advice("data/my set", operation, {f"operation.{setting}": value}))
     config = draccus.parse(EditDatasetConfig, args=flags)

@@ -8,11 +8,20 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("lerobot_wmrl", "policies", "datasets", "robots")
 
 DOCUMENTED = {
-    "lerobot.configs", "lerobot.configs.policies", "lerobot.configs.rewards", "lerobot.configs.types",
-    "lerobot.datasets.lerobot_dataset", "lerobot.envs", "lerobot.envs.configs", "lerobot.optim",
-    "lerobot.policies.pretrained", "lerobot.processor", "lerobot.rewards.pretrained", "lerobot.robots",
+    "lerobot.configs",
+    "lerobot.configs.policies",
+    "lerobot.configs.rewards",
+    "lerobot.configs.types",
+    "lerobot.datasets.lerobot_dataset",
+    "lerobot.envs",
+    "lerobot.envs.configs",
+    "lerobot.optim",
+    "lerobot.policies.pretrained",
+    "lerobot.processor",
+    "lerobot.rewards.pretrained",
+    "lerobot.robots",
     "lerobot.utils.constants",
-}  # fmt: skip
+}
 """Modules that LeRobot's guides to policies, environments, processors, datasets and robots tell plugins to
 import."""
 
@@ -20,7 +29,10 @@ UNDOCUMENTED = {
     "lerobot.common.wandb_utils": {"WandBLogger"},
     "lerobot.configs.default": {"PeftConfig", "WandBConfig"},
     "lerobot.configs.video": {
-        "DEPTH_METER_UNIT", "DepthEncoderConfig", "RGBEncoderConfig", "infer_depth_unit",
+        "DEPTH_METER_UNIT",
+        "DepthEncoderConfig",
+        "RGBEncoderConfig",
+        "infer_depth_unit",
     },
     "lerobot.datasets.aggregate": {"aggregate_datasets"},
     "lerobot.datasets.dataset_metadata": {"CODEBASE_VERSION", "LeRobotDatasetMetadata"},
@@ -31,13 +43,18 @@ UNDOCUMENTED = {
     "lerobot.datasets.utils": {"EPISODES_DIR", "BackwardCompatibilityError"},
     "lerobot.datasets.video_utils": {"decode_video_frames"},
     "lerobot.envs.utils": {
-        "NEW_ROLLOUT_OPTION", "FreezeAfterEpisodeEnd", "env_to_policy_features", "preprocess_observation",
+        "NEW_ROLLOUT_OPTION",
+        "FreezeAfterEpisodeEnd",
+        "env_to_policy_features",
+        "preprocess_observation",
     },
     "lerobot.optim.optimizers": {"AdamWConfig"},
     "lerobot.optim.schedulers": {"CosineDecayWithWarmupSchedulerConfig", "LRSchedulerConfig"},
     "lerobot.policies.factory": {"get_policy_class", "make_pre_post_processors"},
     "lerobot.rewards.factory": {
-        "get_reward_model_class", "make_reward_model", "make_reward_pre_post_processors",
+        "get_reward_model_class",
+        "make_reward_model",
+        "make_reward_pre_post_processors",
     },
     "lerobot.rl.algorithms.base": {"RLAlgorithm"},
     "lerobot.rl.algorithms.configs": {"RLAlgorithmConfig", "TrainingStats"},
@@ -46,11 +63,15 @@ UNDOCUMENTED = {
     "lerobot.utils.keyboard_input": {"apply_recording_control"},
     "lerobot.utils.logging_utils": {"MetricsTracker"},
     "lerobot.utils.random_utils": {
-        "deserialize_rng_state", "get_rng_state", "seeded_context", "serialize_rng_state", "set_rng_state",
+        "deserialize_rng_state",
+        "get_rng_state",
+        "seeded_context",
+        "serialize_rng_state",
+        "set_rng_state",
         "set_seed",
     },
     "lerobot.utils.utils": {"SuppressProgressBars", "flatten_dict", "init_logging"},
-}  # fmt: skip
+}
 """May change with any release: whoever adds one writes it down, and whoever raises the version reads this."""
 
 

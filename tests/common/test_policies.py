@@ -71,10 +71,14 @@ def test_of_a_revision_on_the_hub_all_is_loaded_from_there(hub: Hub, tmp_path: P
         read_policy_config(str(saved[0]), ["--pretrained_revision=abc"])
 
 
-@pytest.mark.parametrize(("content", "message"), [
-    (None, "nothing_here"), ("", "config.json is missing"),
-    ('{"type": "action_world_model"}', "no policy can be loaded"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "nothing_here"),
+        ("", "config.json is missing"),
+        ('{"type": "action_world_model"}', "no policy can be loaded"),
+    ],
+)
 def test_what_is_no_policy_is_refused(content: str | None, message: str, tmp_path: Path) -> None:
     folder = tmp_path / "nothing_here"
     if content is not None:
@@ -104,11 +108,14 @@ def test_images_may_be_described_with_their_channels_last(tmp_path: Path) -> Non
         check_fit(config, {IMAGE: (3, 64, 48)}, action_size=3)
 
 
-@pytest.mark.parametrize(("camera", "size", "actions", "message"), [
-    ("wrist", 32, 3, r"needs observation\.images\.wrist.*cameras: observation\.images\.third_view"),
-    ("third_view", 64, 3, r"\(3, 64, 64\), the environment has \(3, 32, 32\)"),
-    ("third_view", 32, 5, "5 action components, the environment 3"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("camera", "size", "actions", "message"),
+    [
+        ("wrist", 32, 3, r"needs observation\.images\.wrist.*cameras: observation\.images\.third_view"),
+        ("third_view", 64, 3, r"\(3, 64, 64\), the environment has \(3, 32, 32\)"),
+        ("third_view", 32, 5, "5 action components, the environment 3"),
+    ],
+)
 def test_an_environment_that_does_not_fit_is_refused(
     camera: str, size: int, actions: int, message: str, tmp_path: Path
 ) -> None:

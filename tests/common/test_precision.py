@@ -36,8 +36,15 @@ def test_another_precision_is_named() -> None:
         training_dtype("half", "cpu")
 
 
-@pytest.mark.parametrize(("device", "setting"), [
-    ("cpu", "cpu"), ("cuda:1", "cuda:1"), ("cuda", "cuda"), ("mps:0", "mps"), ("xpu:0", "xpu"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("device", "setting"),
+    [
+        ("cpu", "cpu"),
+        ("cuda:1", "cuda:1"),
+        ("cuda", "cuda"),
+        ("mps:0", "mps"),
+        ("xpu:0", "xpu"),
+    ],
+)
 def test_lerobots_settings_name_devices_without_a_number_but_for_cuda(device: str, setting: str) -> None:
     assert device_setting(torch.device(device)) == setting

@@ -17,9 +17,12 @@ from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 
 CONFIGS = {
-    "demo": DemoConfig, "train-world-model": TrainWorldModelConfig, "eval-world-model": EvalWorldModelConfig,
-    "train": TrainConfig, "sft": TrainPipelineConfig,
-}  # fmt: skip
+    "demo": DemoConfig,
+    "train-world-model": TrainWorldModelConfig,
+    "eval-world-model": EvalWorldModelConfig,
+    "train": TrainConfig,
+    "sft": TrainPipelineConfig,
+}
 REQUIRED = {TrainPipelineConfig: ["--dataset.repo_id=local/data"]}
 FILES = sorted(presets.FOLDER.glob("*/*.yaml"))
 

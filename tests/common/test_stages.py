@@ -106,9 +106,15 @@ def test_an_optional_stage_that_was_killed_has_not_failed(tmp_path: Path) -> Non
     assert "failed" not in read_record(tmp_path, "b")
 
 
-@pytest.mark.parametrize(("left", "kept"), [
-    ([], False), (["000100"], False), (["000100", "000200"], True), (["000100", "last"], True),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("left", "kept"),
+    [
+        ([], False),
+        (["000100"], False),
+        (["000100", "000200"], True),
+        (["000100", "last"], True),
+    ],
+)
 def test_what_an_interrupted_command_left_is_removed_unless_it_goes_on_from_there(
     left: list[str], kept: bool, tmp_path: Path
 ) -> None:
@@ -117,7 +123,7 @@ def test_what_an_interrupted_command_left_is_removed_unless_it_goes_on_from_ther
     folder = tmp_path / "trained"
     for name in ("", *left):
         (folder / "checkpoints" / name).mkdir(parents=True, exist_ok=True)
-    assert ("--resume=true" in train_command(folder, [])) == kept
+    assert ("--resume=true" in train_command(folder, {})) == kept
     assert edit_command(folder, "merge", {})
     assert folder.exists()
     seen = f"import pathlib; assert pathlib.Path({str(folder)!r}).exists() == {kept}"
@@ -181,10 +187,14 @@ def wait_until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
 @pytest.mark.parametrize(
     "flags",
     [
-        {"seed": -1}, {"seed": 10}, {"eval_episodes": 0}, {"rollouts": 0}, {"rollouts": 50_001},
+        {"seed": -1},
+        {"seed": 10},
+        {"eval_episodes": 0},
+        {"rollouts": 0},
+        {"rollouts": 50_001},
         {"rollouts": 11, "demonstrations": 8},
     ],
-)  # fmt: skip
+)
 def test_impossible_settings_are_named(flags: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(flags))}="):
         DemoConfig(**flags).validate()

@@ -47,10 +47,17 @@ def degrees(frames: int = 400) -> np.ndarray:
     return actions
 
 
-@pytest.mark.parametrize(("names", "found"), [
-    (["x", "y"], ["x", "y"]), ({"motors": ["x", "y"]}, ["x", "y"]), ({"x": 0, "y": 1}, ["x", "y"]),
-    (None, ["0", "1"]), (["x"], ["0", "1"]), ({"a": ["x"], "b": ["y"]}, ["x", "y"]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        (["x", "y"], ["x", "y"]),
+        ({"motors": ["x", "y"]}, ["x", "y"]),
+        ({"x": 0, "y": 1}, ["x", "y"]),
+        (None, ["0", "1"]),
+        (["x"], ["0", "1"]),
+        ({"a": ["x"], "b": ["y"]}, ["x", "y"]),
+    ],
+)
 def test_components_have_names(names: object, found: list[str]) -> None:
     assert component_names({"shape": (2,), "names": names}) == found
 
@@ -127,12 +134,15 @@ def test_a_recorded_range_goes_before_a_guessed_one_and_a_given_one_before_both(
     assert read_embodiment(meta, given).action_high == [1.0] * 3
 
 
-@pytest.mark.parametrize(("low", "high", "message"), [
-    ([0.0], [1.0], "action has 3 components: shoulder, elbow, gripper"),
-    ([0.0] * 3, [], "without the other end"),
-    ([0.0, 2.0, 0.0], [1.0] * 3, r"elbow would range from 2\.0 to 1\.0"),
-    ([0.0, np.nan, 0.0], [1.0] * 3, "elbow would range from nan"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("low", "high", "message"),
+    [
+        ([0.0], [1.0], "action has 3 components: shoulder, elbow, gripper"),
+        ([0.0] * 3, [], "without the other end"),
+        ([0.0, 2.0, 0.0], [1.0] * 3, r"elbow would range from 2\.0 to 1\.0"),
+        ([0.0, np.nan, 0.0], [1.0] * 3, "elbow would range from nan"),
+    ],
+)
 def test_a_range_that_is_none_is_refused(
     low: list[float], high: list[float], message: str, tmp_path: Path
 ) -> None:

@@ -44,9 +44,9 @@ def test_where_episodes_merely_end_nothing_is_added(tmp_path: Path) -> None:
     flag = {"dtype": "bool", "shape": (1,), "names": None}
     dataset = LeRobotDataset.create("local/ends", 10, FEATURES | {"next.done": flag}, root=tmp_path / "d")
     for step in range(5):
-        dataset.add_frame({
-            "action": np.zeros(1, np.float32), "next.done": np.array([step == 4]), "task": "open"
-        })  # fmt: skip
+        dataset.add_frame(
+            {"action": np.zeros(1, np.float32), "next.done": np.array([step == 4]), "task": "open"}
+        )
     dataset.save_episode()
     dataset.finalize()
     table = read_episodes(open_dataset(tmp_path / "d"))
@@ -63,11 +63,18 @@ def test_a_frame_shows_success_after_the_action_that_leads_to_it(tmp_path: Path)
     require_shown(table, [0, 1])
 
 
-@pytest.mark.parametrize(("shape", "names"), [
-    ((48, 64, 3), ["height", "width", "channels"]), ((48, 64, 3), ["height", "width", "channel"]),
-    ((3, 48, 64), ["channels", "height", "width"]), ((48, 64, 3), ["height", "width", "rgb"]),
-    ((3, 48, 64), ["c", "h", "w"]), ((48, 64, 3), None), ((48, 64, 1), ["height", "width", "depth"]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("shape", "names"),
+    [
+        ((48, 64, 3), ["height", "width", "channels"]),
+        ((48, 64, 3), ["height", "width", "channel"]),
+        ((3, 48, 64), ["channels", "height", "width"]),
+        ((48, 64, 3), ["height", "width", "rgb"]),
+        ((3, 48, 64), ["c", "h", "w"]),
+        ((48, 64, 3), None),
+        ((48, 64, 1), ["height", "width", "depth"]),
+    ],
+)
 def test_the_size_of_frames_is_read_whatever_their_channels_are_called(
     shape: tuple[int, ...], names: list[str] | None
 ) -> None:
@@ -110,9 +117,9 @@ def test_where_no_frame_shows_success_the_last_ones_are_taken_for_it(
     dataset = LeRobotDataset.create("local/ends", 10, FEATURES | {"next.success": flag}, root=tmp_path / "d")
     for episode in recorded:
         for success in episode:
-            dataset.add_frame({
-                "action": np.zeros(1, np.float32), "next.success": np.array([bool(success)]), "task": "open"
-            })  # fmt: skip
+            dataset.add_frame(
+                {"action": np.zeros(1, np.float32), "next.success": np.array([bool(success)]), "task": "open"}
+            )
         dataset.save_episode()
     dataset.finalize()
     table = read_episodes(open_dataset(tmp_path / "d"))

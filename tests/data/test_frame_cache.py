@@ -80,9 +80,11 @@ def test_depth_stored_as_images_is_read_in_its_unit(dtype, unit, tmp_path, monke
     """A long episode in parts."""
     monkeypatch.setattr(frame_cache, "DECODED", 2)
     depth_map = {
-        "dtype": "image", "shape": (SIZE, SIZE, 1), "names": ["height", "width", "channels"],
+        "dtype": "image",
+        "shape": (SIZE, SIZE, 1),
+        "names": ["height", "width", "channels"],
         "info": {"is_depth_map": True},
-    }  # fmt: skip
+    }
     dataset = LeRobotDataset.create(
         "local/stored", FPS, {f"{CAMERA}_depth": depth_map}, root=tmp_path / "stored", use_videos=False
     )
@@ -103,9 +105,11 @@ def test_depth_stored_as_images_is_read_in_its_unit(dtype, unit, tmp_path, monke
 def test_what_was_not_measured_does_not_count_in_a_batch_of_lerobot_train_either(tmp_path):
     """LeRobot gives such pixels of a video its least depth, 1 cm by default."""
     depth_map = {
-        "dtype": "video", "shape": (SIZE, SIZE, 1), "names": ["height", "width", "channels"],
+        "dtype": "video",
+        "shape": (SIZE, SIZE, 1),
+        "names": ["height", "width", "channels"],
         "info": {"is_depth_map": True},
-    }  # fmt: skip
+    }
     dataset = LeRobotDataset.create(
         "local/holes", FPS, {f"{CAMERA}_depth": depth_map}, root=tmp_path / "holes"
     )
@@ -161,10 +165,16 @@ def test_a_batch_of_lerobot_train_has_the_depth_of_the_cache(deep_dataset, model
     model = load_model(models["action_world_model"], "action_world_model")
     times = [step / FPS for step in range(-9, 1)]
     windows = LeRobotDataset(
-        "local/synthetic", root=deep_dataset.root, video_backend="pyav",
-        delta_timestamps={CAMERA: times, f"{CAMERA}_depth": times, "observation.state": times,
-                          "action": times},
-    )  # fmt: skip
+        "local/synthetic",
+        root=deep_dataset.root,
+        video_backend="pyav",
+        delta_timestamps={
+            CAMERA: times,
+            f"{CAMERA}_depth": times,
+            "observation.state": times,
+            "action": times,
+        },
+    )
     batch: dict[str, Any] = torch.utils.data.default_collate([windows[4], windows[9]])
     clip = model.clip_from_batch(batch)
     depth = cached_depth(deep_dataset, [CAMERA], model.tokenizer.grid)
@@ -200,9 +210,10 @@ def test_replays_measure_depth_on_the_tokens_grid(deep_dataset, models, tmp_path
         EvalWorldModelConfig(
             model=Checkpoint(str(models["action_world_model"])),
             text_model=Checkpoint(str(models["text_world_model"])),
-            dataset=ChosenEpisodes(str(Path(deep_dataset.root))), output_dir=tmp_path / "replay",
+            dataset=ChosenEpisodes(str(Path(deep_dataset.root))),
+            output_dir=tmp_path / "replay",
         )
-    )  # fmt: skip
+    )
     metrics = json.loads((tmp_path / "replay" / "metrics.json").read_text())
     assert 0 < metrics["headline"]["abs_rel"]["value"] < 0.2
     assert metrics["headline"]["delta_2"]["value"] > 0.9
@@ -214,8 +225,10 @@ def test_the_environment_begins_with_the_depth_of_its_starts(deep_dataset, model
         return WorldModelEnv(
             world_model_path=str(models["action_world_model"]),
             text_world_model_path=str(models["text_world_model"]),
-            dataset=StartFrames(root=str(Path(dataset.root))), episode_length=3, done_threshold=0.999,
-        )  # fmt: skip
+            dataset=StartFrames(root=str(Path(dataset.root))),
+            episode_length=3,
+            done_threshold=0.999,
+        )
 
     env = config(deep_dataset).create_tensor_env(2)
     env.reset(seed=[1, 4])
@@ -238,8 +251,9 @@ def test_a_dataset_without_depth_is_named_before_anything_is_trained(small_datas
     with pytest.raises(FieldError, match=r"^depth=True: .*third_view_depth, .*--depth=true"):
         run_training(
             action_config(trained_models["frame_tokenizer"], dynamics="autoregressive", depth=True),
-            Path(small_dataset.root), tmp_path / "out",
-        )  # fmt: skip
+            Path(small_dataset.root),
+            tmp_path / "out",
+        )
     assert not (tmp_path / "out").exists()
 
 

@@ -42,9 +42,11 @@ def published(empty_cache: None, small_dataset: LeRobotDataset) -> LeRobotDatase
 
 @pytest.fixture
 def in_many_files(
-    empty_cache: None, make_synthetic_dataset: Callable[..., LeRobotDataset],
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
-) -> LeRobotDataset:  # fmt: skip
+    empty_cache: None,
+    make_synthetic_dataset: Callable[..., LeRobotDataset],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> LeRobotDataset:
     """Four episodes on the hub, each in a video and a table of its own, as those of a large dataset are."""
     monkeypatch.setattr(feature_utils, "DEFAULT_VIDEO_FILE_SIZE_IN_MB", 1e-6)
     monkeypatch.setattr(feature_utils, "DEFAULT_DATA_FILE_SIZE_IN_MB", 1e-6)

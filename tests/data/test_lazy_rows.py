@@ -46,10 +46,17 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "data.cache" / "numbers-1.rows"
 
 
-@pytest.mark.parametrize(("index", "units"), [
-    (4, [3, 4, 5]), (slice(1, 3), [0, 1, 2]), (np.array([[0, 9], [9, 1]]), [0, 1, 6, 7, 8, 9]),
-    ((2, 1), [2]), (np.arange(10) == 2, [2]), (slice(0, 0), []),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("index", "units"),
+    [
+        (4, [3, 4, 5]),
+        (slice(1, 3), [0, 1, 2]),
+        (np.array([[0, 9], [9, 1]]), [0, 1, 6, 7, 8, 9]),
+        ((2, 1), [2]),
+        (np.arange(10) == 2, [2]),
+        (slice(0, 0), []),
+    ],
+)
 def test_what_is_read_is_computed_with_its_unit_and_once(path: Path, index: object, units: list[int]) -> None:
     computed: list[int] = []
     rows, every = rows_at(path, computed), np.repeat(np.arange(10)[:, None], 2, 1)

@@ -25,8 +25,9 @@ def test_models_datasets_and_files_are_known_by_their_content(
     env = WorldModelEnv(
         world_model_path=str(tmp_path / "action_world_model"),
         text_world_model_path=str(tmp_path / "text_world_model"),
-        dataset=StartFrames(root=str(tmp_path / "data"), frames=str(frames)), reward=GeneralConfig(),
-    )  # fmt: skip
+        dataset=StartFrames(root=str(tmp_path / "data"), frames=str(frames)),
+        reward=GeneralConfig(),
+    )
     first = content_of(env)
     assert first.keys() == {"world_model_path", "text_world_model_path", "dataset", "dataset.frames"}
     assert content_of(env) == first
@@ -36,15 +37,18 @@ def test_models_datasets_and_files_are_known_by_their_content(
     stats.write_text(stats.read_text() + "\n")
     changed = content_of(env)
     assert {name for name in first if first[name] != changed[name]} == {
-        "world_model_path", "dataset", "dataset.frames",
-    }  # fmt: skip
+        "world_model_path",
+        "dataset",
+        "dataset.frames",
+    }
     assert content_of(PushtEnv()) == content_of(None) == {}
 
 
 def test_what_is_not_there_is_named_by_its_setting(trained_models: dict[str, Path], tmp_path: Path) -> None:
     env = WorldModelEnv(
         world_model_path=str(trained_models["action_world_model"]),
-        text_world_model_path=str(tmp_path / "nothing"), reward=GeneralConfig(),
-    )  # fmt: skip
+        text_world_model_path=str(tmp_path / "nothing"),
+        reward=GeneralConfig(),
+    )
     with pytest.raises(FieldError, match=r"^text_world_model_path=.*nothing: nothing can be read there"):
         content_of(env)

@@ -24,8 +24,9 @@ def config(small_dataset, trained_models) -> WorldModelEnv:
         world_model_path=str(trained_models["action_world_model"]),
         text_world_model_path=str(trained_models["text_world_model"]),
         dataset=StartFrames(root=str(Path(small_dataset.root)), max_starts=1),
-        episode_length=50, done_threshold=0.999,
-    )  # fmt: skip
+        episode_length=50,
+        done_threshold=0.999,
+    )
 
 
 @pytest.fixture(params=["tokenizer", "mse", "lpips"])

@@ -78,12 +78,15 @@ def test_lerobots_own_type_of_them_is_refused_where_it_cannot_be_trusted() -> No
         make_tensor_env(IsaaclabArenaEnv(), 1, "cpu")
 
 
-@pytest.mark.parametrize(("path", "message"), [
-    ("someone/nothing", "cannot be had"),
-    (f"{PATH}@main:nothing.py", "cannot be had: Could not find nothing.py"),
-    ("no repository", "cannot be had: Repo id must"),
-    (f"{PATH}@main:single.py", r"asked for 2 environments at once, its make_env made \[1\]"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("someone/nothing", "cannot be had"),
+        (f"{PATH}@main:nothing.py", "cannot be had: Could not find nothing.py"),
+        ("no repository", "cannot be had: Repo id must"),
+        (f"{PATH}@main:single.py", r"asked for 2 environments at once, its make_env made \[1\]"),
+    ],
+)
 def test_what_cannot_be_made_is_named(hub: Hub, path: str, message: str) -> None:
     publish(hub, single=FILE + "\n\ndef make_env(n_envs=1, use_async_envs=False):\n    return make_one()\n")
     with pytest.raises(FieldError, match=message):
@@ -96,9 +99,12 @@ def test_commands_take_it_lerobots_too(
     publish(hub, env=FILE)
     policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2, constant=250.0)
     flags = [
-        f"--policy.path={policy}", "--env.type=hub", f"--env.hub_path={PATH}",
-        "--env.trust_remote_code=true", "--env.fps=10",
-    ]  # fmt: skip
+        f"--policy.path={policy}",
+        "--env.type=hub",
+        f"--env.hub_path={PATH}",
+        "--env.trust_remote_code=true",
+        "--env.fps=10",
+    ]
     run_here("lerobot-wmrl-record", *flags, "--num_episodes=2", f"--output_dir={tmp_path / 'rollouts'}")
     run_here("lerobot-wmrl-record", *flags, "--num_episodes=2", f"--output_dir={tmp_path / 'rollouts'}")
     assert "is already recorded: 2 episodes" in capsys.readouterr().out
@@ -123,9 +129,14 @@ def test_rl_trains_in_it_and_says_how_to_evaluate_there(
     publish(hub, env=FILE)
     policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2, constant=250.0)
     flags = [
-        f"--policy.path={policy}", "--env.type=hub", f"--env.hub_path={PATH}", "--env.trust_remote_code=true",
-        "--num_envs=2", "--iterations=1", f"--output_dir={tmp_path / 'rl'}",
-    ]  # fmt: skip
+        f"--policy.path={policy}",
+        "--env.type=hub",
+        f"--env.hub_path={PATH}",
+        "--env.trust_remote_code=true",
+        "--num_envs=2",
+        "--iterations=1",
+        f"--output_dir={tmp_path / 'rl'}",
+    ]
     for _ in range(2):
         run_here("lerobot-wmrl-train", *flags)
     again = capfd.readouterr().out.partition("already trained for 1 iterations")[2]

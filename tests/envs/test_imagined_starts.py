@@ -37,16 +37,28 @@ def test_starts_can_be_chosen_by_task_and_scene(config):
         count(tasks=["fly"])
 
 
-@pytest.mark.parametrize(("given", "message"), [
-    ({"frames": Path("starts.npz"), "tasks": [TASK_NAMES[0]]}, "saved frames do not say their task"),
-    ({"frames": Path("starts.npz"), "split": "ood"}, "saved frames do not say their task, scene or split"),
-    ({"resets": 2, "split": "validation,ood"}, r"split=validation,ood: .*ManiSkill.* ind or ood"),
-    ({"resets": -1}, r"^dataset\.resets=-1: must be at least 1"),
-    ({"resets": 2, "branches": 1}, r"^dataset\.branches=1: .*; saved frames and resets are first frames"),
-    ({"root": "data", "branches": -1}, r"^dataset\.branches=-1: .* branch off from episodes of a dataset"),
-    ({"root": "data", "branches": 9, "max_starts": 9}, r"^dataset\.branches=9: .* more than the 9 starts"),
-    ({"resets": 2, "episodes": [1]}, r"^dataset\.episodes=\[1\]: .*leave it out"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"frames": Path("starts.npz"), "tasks": [TASK_NAMES[0]]}, "saved frames do not say their task"),
+        (
+            {"frames": Path("starts.npz"), "split": "ood"},
+            "saved frames do not say their task, scene or split",
+        ),
+        ({"resets": 2, "split": "validation,ood"}, r"split=validation,ood: .*ManiSkill.* ind or ood"),
+        ({"resets": -1}, r"^dataset\.resets=-1: must be at least 1"),
+        ({"resets": 2, "branches": 1}, r"^dataset\.branches=1: .*; saved frames and resets are first frames"),
+        (
+            {"root": "data", "branches": -1},
+            r"^dataset\.branches=-1: .* branch off from episodes of a dataset",
+        ),
+        (
+            {"root": "data", "branches": 9, "max_starts": 9},
+            r"^dataset\.branches=9: .* more than the 9 starts",
+        ),
+        ({"resets": 2, "episodes": [1]}, r"^dataset\.episodes=\[1\]: .*leave it out"),
+    ],
+)
 def test_what_starts_cannot_be_chosen_by_is_refused(config, given, message):
     """Rather than ignored."""
     with pytest.raises(ValueError, match=message):
@@ -60,7 +72,7 @@ def test_episodes_begin_in_saved_frames_as_in_those_of_the_dataset(config, env, 
         IMAGE: np.stack([(255 * row[IMAGE]).round().byte().permute(1, 2, 0).numpy() for row in rows]),
         STATE: np.stack([row[STATE].numpy() for row in rows]),
         "task": np.array([row["task"] for row in rows]),
-    }  # fmt: skip
+    }
     path = tmp_path / "starts.npz"
     saved = replace(config, dataset=StartFrames(frames=path, max_starts=4))
     np.savez(path, **whole)
@@ -69,9 +81,12 @@ def test_episodes_begin_in_saved_frames_as_in_those_of_the_dataset(config, env, 
     assert torch.equal(found.frames.state, env.starts.frames.state[spread])
     assert found.instructions == [env.starts.instructions[row] for row in spread]
     for name, value in (
-        (IMAGE, whole[IMAGE][:, :16]), (STATE, whole[STATE][:, :3]), ("task", whole["task"][:3]),
-        ("task", np.array("push")), (STATE, whole[STATE][:5]),
-    ):  # fmt: skip
+        (IMAGE, whole[IMAGE][:, :16]),
+        (STATE, whole[STATE][:, :3]),
+        ("task", whole["task"][:3]),
+        ("task", np.array("push")),
+        (STATE, whole[STATE][:5]),
+    ):
         np.savez(path, **{**whole, name: value})
         with pytest.raises(ValueError, match=rf"^dataset\.frames=.*needs {name} of shape \(6,"):
             saved.create_tensor_env(2)

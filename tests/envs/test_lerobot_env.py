@@ -106,11 +106,12 @@ def test_later_episodes_are_the_same_again_too(
     for each in env.envs:
         reset = each.unwrapped.reset
         monkeypatch.setattr(
-            each.unwrapped, "reset",
+            each.unwrapped,
+            "reset",
             lambda seed=None, reset=reset, **given: reset(
                 seed=int(unseeded.integers(2**31)) if seed is None else seed, **given
             ),
-        )  # fmt: skip
+        )
     begun = []
     for seed in (5, 5, 6):
         env.reset(seed=seed)
@@ -279,10 +280,17 @@ def test_ppo_trains_in_it_and_the_best_policy_is_selected_there(
 ) -> None:
     policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2, constant=250.0)
     flags = [
-        f"--policy.path={policy}", "--env.type=pusht", f"--env.episode_length={STEPS}",
-        "--algorithm.type=ppo", "--algorithm.value_iterations=1", f"--num_envs={B}", "--iterations=1",
-        "--selection.freq=1", "--selection.n_episodes=1", f"--output_dir={tmp_path / 'rl'}",
-    ]  # fmt: skip
+        f"--policy.path={policy}",
+        "--env.type=pusht",
+        f"--env.episode_length={STEPS}",
+        "--algorithm.type=ppo",
+        "--algorithm.value_iterations=1",
+        f"--num_envs={B}",
+        "--iterations=1",
+        "--selection.freq=1",
+        "--selection.n_episodes=1",
+        f"--output_dir={tmp_path / 'rl'}",
+    ]
     monkeypatch.setattr(sys, "argv", ["lerobot-wmrl-train", *flags])
     main()
     line = read_metrics(tmp_path / "rl")[-1]

@@ -140,8 +140,9 @@ def test_lerobot_gets_an_environment_of_each_task() -> None:
     made = WmrlManiSkillEnv(task="pull, push").create_envs(1)
     try:
         assert {suite: envs[0].call("task") for suite, envs in made.items()} == {
-            "pull": ("pull",), "push": ("push",),
-        }  # fmt: skip
+            "pull": ("pull",),
+            "push": ("push",),
+        }
         lengths = [envs[0].call("_max_episode_steps")[0] for envs in made.values()]
         assert lengths == [TASKS["pull"].horizon, TASKS["push"].horizon]
     finally:

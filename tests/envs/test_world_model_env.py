@@ -263,9 +263,11 @@ def test_models_that_do_not_fit_together_are_refused(config, small_dataset, trai
     with pytest.raises(ValueError, match="another tokenizer"):
         replace(config, text_world_model_path=str(text)).create_tensor_env(1)
     evaluation = EvalWorldModelConfig(
-        model=Checkpoint(str(trained_models["action_world_model"])), text_model=Checkpoint(str(text)),
-        dataset=ChosenEpisodes(str(root)), output_dir=tmp_path / "evaluation",
-    )  # fmt: skip
+        model=Checkpoint(str(trained_models["action_world_model"])),
+        text_model=Checkpoint(str(text)),
+        dataset=ChosenEpisodes(str(root)),
+        output_dir=tmp_path / "evaluation",
+    )
     with pytest.raises(ValueError, match="another tokenizer"):
         eval_world_model(evaluation)
     assert not evaluation.output_dir.exists()

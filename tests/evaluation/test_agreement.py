@@ -37,9 +37,13 @@ IMAGE = "observation.images.third_view"
 def imagination(small_dataset, trained_models) -> WorldModelEnv:
     return WorldModelEnv(
         world_model_path=str(trained_models["action_world_model"]),
-        dataset=StartFrames(root=str(Path(small_dataset.root))), reward=GeneralConfig(alpha=1.0),
-        done_threshold=0.0001, done_frames=1, episode_length=4, device="cpu",
-    )  # fmt: skip
+        dataset=StartFrames(root=str(Path(small_dataset.root))),
+        reward=GeneralConfig(alpha=1.0),
+        done_threshold=0.0001,
+        done_frames=1,
+        episode_length=4,
+        device="cpu",
+    )
 
 
 def test_every_checkpoint_of_a_training_counts_in_order(tmp_path):
@@ -63,10 +67,15 @@ def test_the_evaluation_reports_policies_beside_reality(imagination, small_datas
     """Reality is a world model here too, so that the test needs no simulator."""
     policy = save_untrained_policy(tmp_path / "policy", actions=7)
     cfg = EvalWorldModelConfig(
-        model=Checkpoint(imagination.world_model_path), dataset=ChosenEpisodes(str(Path(small_dataset.root))),
-        output_dir=tmp_path / "check", device="cpu", policies=[str(policy)], policy_episodes=4,
-        done_threshold=0.0001, done_frames=1,
-    )  # fmt: skip
+        model=Checkpoint(imagination.world_model_path),
+        dataset=ChosenEpisodes(str(Path(small_dataset.root))),
+        output_dir=tmp_path / "check",
+        device="cpu",
+        policies=[str(policy)],
+        policy_episodes=4,
+        done_threshold=0.0001,
+        done_frames=1,
+    )
     with pytest.raises(ValueError, match=r"real_env\.type=None: is missing"):
         eval_world_model(cfg)
     assert not cfg.output_dir.exists()
@@ -98,9 +107,11 @@ def test_policies_that_sample_have_the_same_rates_each_time_and_the_world_model_
     monkeypatch.setattr(CnnPolicy, "select_action", sample)
     monkeypatch.setattr(WorldModelEnv, "create_envs", create_envs)
     cfg = EvalWorldModelConfig(
-        model=Checkpoint(imagination.world_model_path), policy_episodes=4, real_env=replace(imagination),
+        model=Checkpoint(imagination.world_model_path),
+        policy_episodes=4,
+        real_env=replace(imagination),
         policies=[str(save_untrained_policy(tmp_path / name, actions=7)) for name in "ab"],
-    )  # fmt: skip
+    )
     for _ in range(2):
         policy_agreement(cfg, imagination, checked_policies(cfg, imagination))
     half = len(drawn) // 2
@@ -108,19 +119,26 @@ def test_policies_that_sample_have_the_same_rates_each_time_and_the_world_model_
     assert [env is imagination for env in made] == [True, False, False] * 2
 
 
-@pytest.mark.parametrize(("policy", "said"), [
-    ({"actions": 3}, "the policy has 3 action components, the environment 7"),
-    ({"actions": 7, "camera": "wrist"}, "wrist"),
-    ({"actions": 7, "constant": 1000.0}, "was trained on actions .* is 1000 on average"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("policy", "said"),
+    [
+        ({"actions": 3}, "the policy has 3 action components, the environment 7"),
+        ({"actions": 7, "camera": "wrist"}, "wrist"),
+        ({"actions": 7, "constant": 1000.0}, "was trained on actions .* is 1000 on average"),
+    ],
+)
 def test_a_policy_that_cannot_act_there_is_refused_before_anything_is_replayed(
     imagination, small_dataset, tmp_path, policy, said
 ):
     cfg = EvalWorldModelConfig(
-        model=Checkpoint(imagination.world_model_path), dataset=ChosenEpisodes(str(Path(small_dataset.root))),
-        policies=[str(save_untrained_policy(tmp_path / "policy", **policy))], policy_episodes=4,
-        real_env=imagination, output_dir=tmp_path / "check", device="cpu",
-    )  # fmt: skip
+        model=Checkpoint(imagination.world_model_path),
+        dataset=ChosenEpisodes(str(Path(small_dataset.root))),
+        policies=[str(save_untrained_policy(tmp_path / "policy", **policy))],
+        policy_episodes=4,
+        real_env=imagination,
+        output_dir=tmp_path / "check",
+        device="cpu",
+    )
     with pytest.raises(ValueError, match=f"^policies=.*{said}"):
         eval_world_model(cfg)
     assert not cfg.output_dir.exists()
@@ -130,9 +148,13 @@ def test_imagined_episodes_are_as_long_as_real_ones_and_none_is_repeated(imagina
     """Those of a simulator's task, or of another environment."""
     for real in (WmrlManiSkillEnv(task="push"), imagination):
         cfg = EvalWorldModelConfig(
-            model=Checkpoint(imagination.world_model_path), dataset=ChosenEpisodes(str(small_dataset.root)),
-            policies=["policy"], policy_episodes=2, real_env=real, device="cpu",
-        )  # fmt: skip
+            model=Checkpoint(imagination.world_model_path),
+            dataset=ChosenEpisodes(str(small_dataset.root)),
+            policies=["policy"],
+            policy_episodes=2,
+            real_env=real,
+            device="cpu",
+        )
         table = read_episodes(cfg.dataset.open())
         assert policies_imagination(cfg, table).episode_length == real.horizon
         cfg.policy_episodes = 7
@@ -148,9 +170,12 @@ def test_a_world_model_without_a_known_success_is_refused_by_the_commands_own_fl
     config = json.loads((root / "config.json").read_text())
     (root / "config.json").write_text(json.dumps({**config, "learnt_successes": 0}))
     cfg = EvalWorldModelConfig(
-        model=Checkpoint(str(root)), dataset=ChosenEpisodes(str(Path(small_dataset.root))),
-        policies=["policy"], real_env=imagination, output_dir=tmp_path / "check",
-    )  # fmt: skip
+        model=Checkpoint(str(root)),
+        dataset=ChosenEpisodes(str(Path(small_dataset.root))),
+        policies=["policy"],
+        real_env=imagination,
+        output_dir=tmp_path / "check",
+    )
     with pytest.raises(
         ValueError, match=r"^model\.path=.*has learnt from no episode that is known to succeed"
     ):

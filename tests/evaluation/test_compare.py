@@ -167,10 +167,14 @@ def config(tmp_path: Path) -> CompareConfig:
 @pytest.fixture
 def imagination(small_dataset: Any, trained_models: dict[str, Path]) -> WorldModelEnv:
     return WorldModelEnv(
-        world_model_path=str(trained_models["action_world_model"]), device="cpu", episode_length=2,
-        dataset=StartFrames(root=str(small_dataset.root)), reward=GeneralConfig(alpha=1.0),
-        done_threshold=0.0001, done_frames=1,
-    )  # fmt: skip
+        world_model_path=str(trained_models["action_world_model"]),
+        device="cpu",
+        episode_length=2,
+        dataset=StartFrames(root=str(small_dataset.root)),
+        reward=GeneralConfig(alpha=1.0),
+        done_threshold=0.0001,
+        done_frames=1,
+    )
 
 
 def results_of(config: CompareConfig) -> dict[str, Any]:
@@ -322,8 +326,13 @@ def test_each_task_has_rates_of_its_own() -> None:
     assert compared.as_json()["by_task"]["lift 3"]["b"] == Proportion(3, 4).as_json()
     lines = str(compared).splitlines()
     assert [line.split("  ")[0] for line in lines[:6]] == [
-        "a", "b", "a, lift 0", "b, lift 0", "a, lift 3", "b, lift 3",
-    ]  # fmt: skip
+        "a",
+        "b",
+        "a, lift 0",
+        "b, lift 0",
+        "a, lift 3",
+        "b, lift 3",
+    ]
     assert "lift" not in str(Comparison("ab", 4, episodes=episodes[:4]))
 
 
@@ -350,9 +359,15 @@ def test_a_world_model_compares_a_policy_with_a_planner(imagination, tmp_path):
     """From each of its six start frames once: a threshold that every frame reaches makes all succeed."""
     planner = tmp_path / "planner"
     settings = WmMpcConfig(
-        world_model_path=imagination.world_model_path, device="cpu", horizon=4, execute=2, samples=4,
-        elites=2, iterations=1, knots=2,
-    )  # fmt: skip
+        world_model_path=imagination.world_model_path,
+        device="cpu",
+        horizon=4,
+        execute=2,
+        samples=4,
+        elites=2,
+        iterations=1,
+        knots=2,
+    )
     WmMpcPolicy(settings).save_pretrained(planner)
     for processor in make_pre_post_processors(settings):
         processor.save_pretrained(planner)

@@ -50,9 +50,17 @@ def test_the_first_run_is_of_consecutive_frames():
     assert first_run(fired, 6).tolist() == [-1, -1, -1]
 
 
-@pytest.mark.parametrize(("threshold", "frames", "false", "recognised"), [
-    (0.5, 3, 1, 2), (0.5, 1, 2, 2), (0.75, 3, 0, 2), (0.85, 3, 0, 1), (0.85, 4, 0, 1), (0.95, 1, 0, 0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("threshold", "frames", "false", "recognised"),
+    [
+        (0.5, 3, 1, 2),
+        (0.5, 1, 2, 2),
+        (0.75, 3, 0, 2),
+        (0.85, 3, 0, 1),
+        (0.85, 4, 0, 1),
+        (0.95, 1, 0, 0),
+    ],
+)
 def test_the_gate_counts_as_the_environment_ends_episodes(outcomes, threshold, frames, false, recognised):
     gate = gate_at(outcomes, SuccessCriterion(threshold, frames))
     assert (gate.false_positives.k, gate.false_positives.n) == (false, 2)
@@ -271,9 +279,13 @@ def test_tasks_of_own_data_are_told_by_their_instructions(outcomes):
 
 def gate_of(false: int, failures: int, recognised: int, successes: int) -> Gate:
     return Gate(
-        criterion=SuccessCriterion(0.5, 2), false_positives=Proportion(false, failures),
-        recall=Proportion(recognised, successes), cut_short=0, repeats_last=False, auc=0.9,
-    )  # fmt: skip
+        criterion=SuccessCriterion(0.5, 2),
+        false_positives=Proportion(false, failures),
+        recall=Proportion(recognised, successes),
+        cut_short=0,
+        repeats_last=False,
+        auc=0.9,
+    )
 
 
 def test_the_gate_allows_five_false_positives_in_a_hundred_and_asks_for_ninety_recognised() -> None:

@@ -85,9 +85,11 @@ def test_a_refused_policy_has_its_reason_in_place_of_an_estimate():
     judgement = with_references(refused={"judged": "it was trained there"})
     assert judgement.estimate("judged") is None
     assert judgement.as_json(True)["policies"]["judged"] == {
-        "imagined": Proportion(50, 100).as_json(), "estimate": None, "real": None,
+        "imagined": Proportion(50, 100).as_json(),
+        "estimate": None,
+        "real": None,
         "refused": "it was trained there",
-    }  # fmt: skip
+    }
     assert "judged  50 % (50 of 100) in imagination; not judged: it was trained there" in str(judgement)
 
 
@@ -134,10 +136,13 @@ def test_other_references_are_refused(content, said, tmp_path):
         read_references(tmp_path / "absent.json")
 
 
-@pytest.mark.parametrize(("starts", "field", "remedy"), [
-    (StartFrames(), "dataset.episodes=[0, 1]", "choose the rollouts of one of them"),
-    (StartFrames(root="s"), "dataset.tasks=None", "choose one of them, and rollouts of the same task"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("starts", "field", "remedy"),
+    [
+        (StartFrames(), "dataset.episodes=[0, 1]", "choose the rollouts of one of them"),
+        (StartFrames(root="s"), "dataset.tasks=None", "choose one of them, and rollouts of the same task"),
+    ],
+)
 def test_starts_of_several_tasks_are_refused(starts, field, remedy):
     config = JudgeConfig(dataset=ChosenEpisodes("d", episodes=[0, 1]), starts=starts)
     with pytest.raises(ValueError, match="the starts are of 2 tasks") as refused:
@@ -163,8 +168,9 @@ def test_rollouts_that_bias_the_confusion_are_warned_about():
     found, warnings = confusion_of(Outcomes(np.arange(3), probability, done, held=9), env)
     assert (found.false_positives, found.recall) == (Proportion(1, 2), Proportion(1, 1))
     assert [warning.partition(" were ")[0].partition(" end ")[0] for warning in warnings] == [
-        "1 of 2 failures", "1 of 1 successes"
-    ]  # fmt: skip
+        "1 of 2 failures",
+        "1 of 1 successes",
+    ]
     assert confusion_of(Outcomes(np.arange(2), probability[1:], done[1:], held=1), env)[1] == []
 
 
@@ -179,10 +185,17 @@ def test_batches_are_even(episodes, most, size):
 def config(small_dataset, trained_models, tmp_path) -> JudgeConfig:
     policies = [str(save_untrained_policy(tmp_path / name, actions=7)) for name in ("a", "b")]
     return JudgeConfig(
-        policies=policies, world_model=Checkpoint(str(trained_models["action_world_model"])),
-        dataset=ChosenEpisodes(str(small_dataset.root)), starts=StartFrames(max_starts=3), batch_size=2,
-        done_threshold=0.0001, done_frames=1, episode_length=20, device="cpu", output_dir=tmp_path / "out",
-    )  # fmt: skip
+        policies=policies,
+        world_model=Checkpoint(str(trained_models["action_world_model"])),
+        dataset=ChosenEpisodes(str(small_dataset.root)),
+        starts=StartFrames(max_starts=3),
+        batch_size=2,
+        done_threshold=0.0001,
+        done_frames=1,
+        episode_length=20,
+        device="cpu",
+        output_dir=tmp_path / "out",
+    )
 
 
 @pytest.fixture
@@ -363,9 +376,10 @@ def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
     write(copy / "train_config.json", {"dataset": {"root": config.dataset.root, "episodes": [0, 1]}})
     assert learnt_from(str(copy), LabelledRollouts.read(config.dataset, episodes=[2, 3])) == 0
     assert learnt_from(str(copy), LabelledRollouts.read(config.dataset, episodes=[1, 2])) == 1
-    write(copy / "train_config.json", {
-        "dataset": {"root": config.dataset.root, "episodes": [0, 1], "more": [again.root]}
-    })  # fmt: skip
+    write(
+        copy / "train_config.json",
+        {"dataset": {"root": config.dataset.root, "episodes": [0, 1], "more": [again.root]}},
+    )
     assert learnt_from(str(copy), LabelledRollouts.read(config.dataset)) == 6, "as copies too"
     (tmp_path / "tokenizer").mkdir()
     write(tmp_path / "tokenizer" / "train_config.json", {"dataset": {"root": config.dataset.root}})
@@ -390,9 +404,13 @@ def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
     write(copy / "train_config.json", {"dataset": {"root": "demonstrations", "more": [others.root]}})
     assert learnt_from(str(copy), LabelledRollouts.read(others)) == 3
     (tmp_path / "further").mkdir()
-    further = write(tmp_path / "further" / "train_config.json", {
-        "dataset": {"root": "rollouts"}, "model": {"pretrained_path": str(copy)},
-    })  # fmt: skip
+    further = write(
+        tmp_path / "further" / "train_config.json",
+        {
+            "dataset": {"root": "rollouts"},
+            "model": {"pretrained_path": str(copy)},
+        },
+    )
     write(further.parent / "config.json", {})
     assert learnt_from(str(further.parent), LabelledRollouts.read(others)) == 3, "from the first on"
     shutil.rmtree(Path(others.root) / "data")
@@ -406,9 +424,10 @@ def test_what_was_trained_where_is_known_in_every_folder(config, small_dataset, 
     shutil.copytree(model_folder(config.world_model.path), model)
     write(model / "train_config.json", {"dataset": {"root": "data"}, "output_dir": "out/wm"})
     (work / "out" / "policy").mkdir()
-    policy = write(work / "out" / "policy" / "train_config.json", {
-        "env": {"world_model_path": "out/wm"}, "output_dir": "out/policy"
-    }).parent  # fmt: skip
+    policy = write(
+        work / "out" / "policy" / "train_config.json",
+        {"env": {"world_model_path": "out/wm"}, "output_dir": "out/policy"},
+    ).parent
     write(policy / "config.json", {})
     write(model / "train_config.json", {"dataset": {"root": "../data"}, "output_dir": "../out/wm"})
     monkeypatch.chdir(work)
@@ -478,10 +497,14 @@ def test_a_policy_in_other_units_is_not_judged(config, tmp_path):
 
 def test_starts_that_cannot_be_read_are_named_by_their_own_flag(config, seeing, monkeypatch, capsys):
     flags = {
-        "policies": f"[{','.join(config.policies)}]", "world_model.path": config.world_model.path,
-        "dataset.root": config.dataset.root, "starts.root": "/nowhere", "output_dir": config.output_dir,
-        "episode_length": 20, "device": "cpu",
-    }  # fmt: skip
+        "policies": f"[{','.join(config.policies)}]",
+        "world_model.path": config.world_model.path,
+        "dataset.root": config.dataset.root,
+        "starts.root": "/nowhere",
+        "output_dir": config.output_dir,
+        "episode_length": 20,
+        "device": "cpu",
+    }
     monkeypatch.setattr(
         "sys.argv", ["lerobot-wmrl-judge", *(f"--{name}={value}" for name, value in flags.items())]
     )

@@ -73,9 +73,13 @@ def test_the_training_of_a_tokenizer_ends_with_the_held_out_episodes(dataset, ou
     assert [factor["size"] for factor in report["code_factors"]] == [5, 4]
 
 
-@pytest.mark.parametrize(("chosen", "split", "measured"), [
-    ([0, 2], "all", [0, 2]), ([0, 19], "validation", [19]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("chosen", "split", "measured"),
+    [
+        ([0, 2], "all", [0, 2]),
+        ([0, 19], "validation", [19]),
+    ],
+)
 def test_episodes_that_were_not_chosen_do_not_count(dataset, output_dir, tmp_path, chosen, split, measured):
     model, table = load_model(output_dir, "frame_tokenizer"), read_episodes(dataset)
     report = write_reconstruction(model, table, tmp_path, chosen)

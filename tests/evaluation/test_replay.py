@@ -221,9 +221,10 @@ def test_an_episode_that_ends_without_success_is_a_failure(small_dataset, model,
 def test_episodes_of_which_nobody_knows_the_outcome_are_no_failures(small_dataset, trained_models, tmp_path):
     root = relabelled(Path(small_dataset.root), tmp_path / "unlabelled", UNLABELLED)
     config = EvalWorldModelConfig(
-        model=Checkpoint(str(trained_models["action_world_model"])), dataset=ChosenEpisodes(str(root)),
+        model=Checkpoint(str(trained_models["action_world_model"])),
+        dataset=ChosenEpisodes(str(root)),
         output_dir=tmp_path / "check",
-    )  # fmt: skip
+    )
     eval_world_model(config)
     metrics = json.loads((tmp_path / "check" / "metrics.json").read_text(), parse_constant=pytest.fail)
     assert (metrics["failures"], metrics["successes"], metrics["passed"]) == (0, 0, False)
@@ -237,20 +238,27 @@ def test_success_is_paid_once_in_the_frame_that_completes_it(source, model, trai
     probability = torch.ones_like(replay.done_probability)
     probability[[0, 3]] = 0.0  # the first run has two frames
     found = reward_along_episode(
-        text_model, GeneralConfig(device="cpu", alpha=1.0), source,
-        replace(replay, done_probability=probability), criterion=SuccessCriterion(0.5, frames), longest=8,
-    )  # fmt: skip
+        text_model,
+        GeneralConfig(device="cpu", alpha=1.0),
+        source,
+        replace(replay, done_probability=probability),
+        criterion=SuccessCriterion(0.5, frames),
+        longest=8,
+    )
     count = len(probability) - 1
     assert found["return"] == [0.0] * 6 + [1.0] * (count - 6)
     assert found["done_probability"] == probability[:-1].tolist()
     returns = [
         reward_along_episode(
-            text_model, GeneralConfig(device="cpu", alpha=0.9), source,
+            text_model,
+            GeneralConfig(device="cpu", alpha=0.9),
+            source,
             replace(replay, done_probability=probability),
-            criterion=SuccessCriterion(0.5, frames), longest=longest,
+            criterion=SuccessCriterion(0.5, frames),
+            longest=longest,
         )["return"][-1]
         for longest in (2, 200)
-    ]  # fmt: skip
+    ]
     assert returns[0] != returns[1], "progress is rewarded with the discount of the environment"
     assert len(found["similarity"]) == count
 
@@ -279,7 +287,11 @@ def test_the_command_writes_figures_and_pictures(small_dataset, trained_models, 
     assert page in capsys.readouterr().out + "\n"
     assert "| PSNR (dB) |" in page
     for name in (
-        "comparison_success.gif", "comparison_failure_strip.png", "goal_frames.png", "accuracy.png",
-        "gate_sweep.png", "reward_along_episodes.png",
-    ):  # fmt: skip
+        "comparison_success.gif",
+        "comparison_failure_strip.png",
+        "goal_frames.png",
+        "accuracy.png",
+        "gate_sweep.png",
+        "reward_along_episodes.png",
+    ):
         assert (folder / name).stat().st_size > 0

@@ -53,9 +53,10 @@ def test_a_dataset_that_the_ledger_does_not_know_stops_the_study(
     """With the flag of any command."""
     given = (f"data={small_dataset.root}",)
     for flags in (
-        "--dataset.root=$data", "--dataset.more=[$data]",
+        "--dataset.root=$data",
+        "--dataset.more=[$data]",
         "--gate.dataset.root=$data",
-    ):  # fmt: skip
+    ):
         fair = study(tmp_path, "true", f"true && true {flags}", given=given)
         with pytest.raises(StudyError, match=r"step_1: --[a-z.]+=.*: 6 of 6 episodes are not in the budget"):
             run_study(fair)
@@ -83,9 +84,10 @@ def test_a_dataset_that_the_step_itself_makes_is_looked_up_afterwards(
     tmp_path: Path, small_dataset: LeRobotDataset
 ) -> None:
     fair = study(
-        tmp_path, "cp -r $data $output_dir/new && true --dataset.root=$output_dir/new",
+        tmp_path,
+        "cp -r $data $output_dir/new && true --dataset.root=$output_dir/new",
         given=(f"data={small_dataset.root}",),
-    )  # fmt: skip
+    )
     with pytest.raises(StudyError, match=r"step_0: --dataset\.root=.*new: 6 of 6 episodes"):
         run_study(fair)
     assert finished(fair) == []
@@ -95,16 +97,19 @@ def test_a_dataset_that_the_step_itself_makes_is_looked_up_afterwards(
     assert finished(fair) == ["step_0"]
 
 
-@pytest.mark.parametrize(("command", "message"), [
-    ("lerobot-wmrl-record --output_dir=x", "step_1: lerobot-wmrl-record needs --budget="),
-    ("a=1 lerobot-wmrl-train-world-model --steps=$$(echo 1 --budget=$budget)", "train-world-model needs"),
-    ("torchrun -m lerobot_wmrl.scripts.train --budget=other.json", "scripts.train needs --budget="),
-    ("true --budget=$budget; lerobot-wmrl-train --seed=1", "lerobot-wmrl-train needs --budget="),
-    ("(lerobot-wmrl-train --seed=1) && true", "lerobot-wmrl-train needs --budget="),
-    ("lerobot-train --dataset.root made", "--dataset.root needs an equals sign"),
-    ("lerobot-train --dataset.root=$$folder", "only the shell knows this dataset"),
-    ("lerobot-train --dataset.more=[a,$$(cat b)]", "only the shell knows this dataset"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("lerobot-wmrl-record --output_dir=x", "step_1: lerobot-wmrl-record needs --budget="),
+        ("a=1 lerobot-wmrl-train-world-model --steps=$$(echo 1 --budget=$budget)", "train-world-model needs"),
+        ("torchrun -m lerobot_wmrl.scripts.train --budget=other.json", "scripts.train needs --budget="),
+        ("true --budget=$budget; lerobot-wmrl-train --seed=1", "lerobot-wmrl-train needs --budget="),
+        ("(lerobot-wmrl-train --seed=1) && true", "lerobot-wmrl-train needs --budget="),
+        ("lerobot-train --dataset.root made", "--dataset.root needs an equals sign"),
+        ("lerobot-train --dataset.root=$$folder", "only the shell knows this dataset"),
+        ("lerobot-train --dataset.more=[a,$$(cat b)]", "only the shell knows this dataset"),
+    ],
+)
 def test_a_command_that_cannot_be_kept_within_the_budget_is_named_at_once(
     command: str, message: str, tmp_path: Path
 ) -> None:
@@ -117,9 +122,10 @@ def test_a_command_that_cannot_be_kept_within_the_budget_is_named_at_once(
 def test_commands_with_the_ledger_pass(tmp_path: Path) -> None:
     """None is run: the first step fails."""
     commands = [
-        "false && lerobot-wmrl-record --seed=$$(echo 0) --budget=$budget", "lerobot-eval --seed=1000000",
+        "false && lerobot-wmrl-record --seed=$$(echo 0) --budget=$budget",
+        "lerobot-eval --seed=1000000",
         "env A=1 lerobot-wmrl-train --budget=$budget --env.dataset.root=$output_dir/x > log",
-    ]  # fmt: skip
+    ]
     with pytest.raises(StudyError, match="step_0: exit status 1"):
         run_study(study(tmp_path, *commands))
 
@@ -143,6 +149,8 @@ def test_every_command_of_a_line_is_read() -> None:
         "s", "a --dataset.root=d --dataset.episodes=[0,2] --env.dataset.root=e --dataset.more='[f, g]'"
     )
     assert [*sources(step)] == [
-        Source("dataset.root", "d", (0, 2)), Source("env.dataset.root", "e", None),
-        Source("dataset.more", "f", None), Source("dataset.more", "g", None),
-    ]  # fmt: skip
+        Source("dataset.root", "d", (0, 2)),
+        Source("env.dataset.root", "e", None),
+        Source("dataset.more", "f", None),
+        Source("dataset.more", "g", None),
+    ]

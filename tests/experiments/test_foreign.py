@@ -27,8 +27,11 @@ def test_a_finished_seed_is_collected(tmp_path: Path) -> None:
     (found,) = metaworld(Study("metaworld", "?", {}, variables, (), None, ())).values()
     assert found["minutes"] == dict.fromkeys(TIMED, 1.5)
     assert {name: each["k"] for name, each in found["policies"].items()} == {
-        "cloned": 1, "further": 2, "longer": 2, "improve": 4
-    }  # fmt: skip
+        "cloned": 1,
+        "further": 2,
+        "longer": 2,
+        "improve": 4,
+    }
     assert found["check"] == {"auc": 0.9}
     assert (found["rollouts"], found["seed"]) == (9, 1)
 
@@ -39,11 +42,15 @@ def test_the_section_compares_the_improved_policy_with_both_clones() -> None:
         if seed == 5:
             raise FileNotFoundError(stem)
         return {
-            "task": "push-v3", "episodes": 40, "noise": "0.0 0.4", "rollouts": 150, "iterations": 60,
+            "task": "push-v3",
+            "episodes": 40,
+            "noise": "0.0 0.4",
+            "rollouts": 150,
+            "iterations": 60,
             "seed": seed,
             "minutes": dict.fromkeys(TIMED, 2.0),
             "policies": {name: rate(OUTCOMES[name]) for name in POLICIES},
-        }  # fmt: skip
+        }
 
     text = section(load)
     assert text.count("| 2 of 4, 50 % ") == 4, "two rows a seed that is published"

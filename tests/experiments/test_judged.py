@@ -18,9 +18,11 @@ PERFECT = {
 def row(estimate: float, k: int, n: int = 100, training: str = "a", half: float = 0.05) -> dict[str, Any]:
     interval = {"value": estimate, "low": estimate - half, "high": estimate + half}
     return {
-        "imagined": {"share": estimate}, "estimate": interval, "real": Proportion(k, n).as_json(),
+        "imagined": {"share": estimate},
+        "estimate": interval,
+        "real": Proportion(k, n).as_json(),
         "training": training,
-    }  # fmt: skip
+    }
 
 
 def test_a_policy_is_calibrated_by_other_trainings_than_its_own():

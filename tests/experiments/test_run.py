@@ -180,13 +180,16 @@ def test_only_what_the_step_itself_writes_is_deleted(tmp_path: Path) -> None:
     assert not left.exists()
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    (COUNT + "colour: red\n", "unknown key colour"),
-    (COUNT.replace("$word", "$wrd"), r"\$wrd in .* there is no such variable"),
-    (COUNT.replace("say_$seed", "say"), "steps with the same name: say"),
-    (COUNT.replace("name: result", "name: result\n    fresh: true"), "step result: `fresh` needs a flag"),
-    ("question: x\nsteps: [say]\n", r"step say: write its name and command; .* \(it extends none\)"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (COUNT + "colour: red\n", "unknown key colour"),
+        (COUNT.replace("$word", "$wrd"), r"\$wrd in .* there is no such variable"),
+        (COUNT.replace("say_$seed", "say"), "steps with the same name: say"),
+        (COUNT.replace("name: result", "name: result\n    fresh: true"), "step result: `fresh` needs a flag"),
+        ("question: x\nsteps: [say]\n", r"step say: write its name and command; .* \(it extends none\)"),
+    ],
+)
 def test_mistakes_are_named(study_file: Path, text: str, message: str) -> None:
     study_file.write_text(text)
     with pytest.raises(ValueError, match=message):

@@ -46,10 +46,15 @@ def test_an_axis_stays_in_its_range(axes):
 
 def test_too_few_successes_are_said(small_dataset, world_model, policy, tmp_path):
     flags = [
-        f"--world_model={world_model}", f"--dataset.root={small_dataset.root}", "--frames=3",
-        f"--policy={policy}", "--episodes=7", "--done_threshold=1e-9", "--done_frames=3",
+        f"--world_model={world_model}",
+        f"--dataset.root={small_dataset.root}",
+        "--frames=3",
+        f"--policy={policy}",
+        "--episodes=7",
+        "--done_threshold=1e-9",
+        "--done_frames=3",
         f"--output_dir={tmp_path / 'person'}",
-    ]  # fmt: skip
+    ]
     with pytest.raises(SystemExit, match="--episodes=7: 6 of 6 drives succeed; ask for fewer"):
         write_script(make_parser().parse_args(flags))
     assert not (tmp_path / "person").exists()
@@ -70,10 +75,15 @@ def script(small_dataset, world_model, policy, tmp_path) -> Path:
     """What the person does in two episodes; nearly everything is a success here."""
     folder = tmp_path / "person"
     flags = [
-        f"--world_model={world_model}", f"--dataset.root={small_dataset.root}", f"--output_dir={folder}",
+        f"--world_model={world_model}",
+        f"--dataset.root={small_dataset.root}",
+        f"--output_dir={folder}",
         f"--policy={policy}",
-        "--episodes=2", f"--frames={FRAMES}", "--done_threshold=1e-9", "--done_frames=3",
-    ]  # fmt: skip
+        "--episodes=2",
+        f"--frames={FRAMES}",
+        "--done_threshold=1e-9",
+        "--done_frames=3",
+    ]
     write_script(make_parser().parse_args(flags))
     return folder
 
@@ -85,16 +95,27 @@ def test_lerobot_record_keeps_what_the_person_does(script, small_dataset, world_
     lengths = [len(actions) for actions in written["actions"]]
     calibration, folder = tmp_path / "calibration", tmp_path / "driven"
     flags = [
-        "--robot.type=imagined", f"--robot.world_model_path={world_model}", "--robot.device=cpu",
-        f"--robot.dataset.root={small_dataset.root}", f"--robot.dataset.episodes={episodes}",
-        "--robot.done_threshold=1e-9", f"--robot.calibration_dir={calibration}",
-        "--teleop.discover_packages_path=experiments.person", "--teleop.type=scripted_person",
+        "--robot.type=imagined",
+        f"--robot.world_model_path={world_model}",
+        "--robot.device=cpu",
+        f"--robot.dataset.root={small_dataset.root}",
+        f"--robot.dataset.episodes={episodes}",
+        "--robot.done_threshold=1e-9",
+        f"--robot.calibration_dir={calibration}",
+        "--teleop.discover_packages_path=experiments.person",
+        "--teleop.type=scripted_person",
         f"--teleop.script={script / 'script.json'}",
-        f"--teleop.calibration_dir={calibration}", "--dataset.repo_id=local/driven",
-        f"--dataset.root={folder}", "--dataset.single_task=push", "--dataset.num_episodes=2",
-        f"--dataset.fps={FPS}", "--dataset.reset_time_s=0",
-        "--dataset.push_to_hub=false", "--dataset.video=false", "--play_sounds=false",
-    ]  # fmt: skip
+        f"--teleop.calibration_dir={calibration}",
+        "--dataset.repo_id=local/driven",
+        f"--dataset.root={folder}",
+        "--dataset.single_task=push",
+        "--dataset.num_episodes=2",
+        f"--dataset.fps={FPS}",
+        "--dataset.reset_time_s=0",
+        "--dataset.push_to_hub=false",
+        "--dataset.video=false",
+        "--play_sounds=false",
+    ]
     monkeypatch.setattr(sys, "argv", ["lerobot-record", *flags])
     record()
     found, source = read_episodes(open_dataset(folder)), read_episodes(small_dataset)

@@ -10,18 +10,15 @@ import numpy as np
 import pytest
 
 from experiments import four_tasks_section, rewards_section, value
+from experiments.controls_section import CONTROLLED, CONTROLS, UNCHANGED, value_controls
 from experiments.run import record_path
 from experiments.study import ROOT, Study, read_cells
 from experiments.tables import loader
 from experiments.value_cells import TITLES, best, gain, groups
 from experiments.value_figure import draw_value
 from experiments.value_sections import (
-    CONTROLLED,
-    CONTROLS,
-    UNCHANGED,
     aims,
     recorded_anew,
-    value_controls,
     value_others,
     value_push,
 )
@@ -158,16 +155,23 @@ def test_gains_of_three_seeds_have_an_interval_over_these(docs: Path) -> None:
 
 
 MAY_DIFFER = {
-    "output_dir", "dataset.root", "model.tokenizer_path", "env.world_model_path", "policy.world_model_path",
+    "output_dir",
+    "dataset.root",
+    "model.tokenizer_path",
+    "env.world_model_path",
+    "policy.world_model_path",
     "policy.proposal_path",
-}  # fmt: skip
+}
 """Flags of a control that name its own dataset and models."""
 
 
-@pytest.mark.parametrize(("studies", "controls", "begins", "number"), [
-    (["value_push"], "value_controls", "start", 7),
-    (["value_push", "value_act"], "value_act_controls", "filtered", 5),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("studies", "controls", "begins", "number"),
+    [
+        (["value_push"], "value_controls", "start", 7),
+        (["value_push", "value_act"], "value_act_controls", "filtered", 5),
+    ],
+)
 def test_a_control_differs_from_the_study_in_nothing_but_the_world_model(
     studies: list[str], controls: str, begins: str, number: int
 ) -> None:

@@ -175,9 +175,7 @@ def test_successes_weigh_more_and_demonstrations_most(
     policy: Any = SimpleNamespace(config=CnnConfig(device="cpu"))
     weighter = make_sample_weighter(config, policy, torch.device("cpu"))
     found, _ = weighter.compute_batch_weights({"index": torch.arange(int(table.length.sum()))})
-    mean = np.array([
-        found[a : a + n - 1].mean() for a, n in zip(table.start, table.length, strict=True)
-    ])  # fmt: skip
+    mean = np.array([found[a : a + n - 1].mean() for a, n in zip(table.start, table.length, strict=True)])
     demonstrated = np.arange(EPISODES) < DEMONSTRATIONS
     assert mean[table.success & ~demonstrated].mean() > 1.1 * mean[~table.success].mean()
     assert mean[demonstrated].min() > mean[~demonstrated].max()

@@ -30,6 +30,7 @@ from lerobot_wmrl.improve.findings import few_decisions, one_sided_tasks, usual_
 from lerobot_wmrl.improve.plan import Plan
 from lerobot_wmrl.improve.progress import CLONED, DISTILLED, FITTED, PPO, SFT, Progress
 from lerobot_wmrl.improve.report.words import reservations
+from lerobot_wmrl.improve.stages import list_stages
 from lerobot_wmrl.scripts.compare import CompareConfig
 from lerobot_wmrl.scripts.improve import settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
@@ -121,12 +122,15 @@ def test_frames_of_any_size_make_a_grid_that_the_transformer_divides(
     assert grid % int(dynamics.get("model.dynamics.patch", AnchoredConfig.patch)) == 0
 
 
-@pytest.mark.parametrize(("kind", "pixels", "flags"), [
-    (CnnConfig, 2 * 64**2, set()),
-    (CnnConfig, 480 * 640, {"--algorithm.micro_batch_size=27"}),
-    (CnnConfig, 1080 * 1920, {"--num_envs=16", "--algorithm.micro_batch_size=4"}),
-    (VQBeTConfig, 480 * 640, {"--num_envs=21", "--algorithm.recorded=false", "--algorithm.batch_size=5"}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("kind", "pixels", "flags"),
+    [
+        (CnnConfig, 2 * 64**2, set()),
+        (CnnConfig, 480 * 640, {"--algorithm.micro_batch_size=27"}),
+        (CnnConfig, 1080 * 1920, {"--num_envs=16", "--algorithm.micro_batch_size=4"}),
+        (VQBeTConfig, 480 * 640, {"--num_envs=21", "--algorithm.recorded=false", "--algorithm.batch_size=5"}),
+    ],
+)
 def test_large_frames_are_trained_on_in_smaller_numbers(
     kind: type[PreTrainedConfig], pixels: int, flags: set[str], tmp_path: Path
 ) -> None:
@@ -139,8 +143,11 @@ def test_large_frames_are_trained_on_in_smaller_numbers(
         tmp_path, policy=policy, pixels=pixels, longest=98, usual=98, success_frames=3000
     )["rl"]
     limits = (
-        "--num_envs=", "--algorithm.micro_batch_size=", "--algorithm.batch_size=", "--algorithm.recorded=",
-    )  # fmt: skip
+        "--num_envs=",
+        "--algorithm.micro_batch_size=",
+        "--algorithm.batch_size=",
+        "--algorithm.recorded=",
+    )
     assert {flag for flag in command if flag.startswith(limits)} == flags
 
 
@@ -154,10 +161,15 @@ def test_imagined_frames_of_a_training_are_2_gib_at_most(
     assert [flag for flag in command if flag.startswith("--num_envs=")] == flags
 
 
-@pytest.mark.parametrize(("found", "taken"), [
-    ({"total": 500, "fewest": 500, "tasks": 1}, 100), ({"total": 60, "fewest": 60, "tasks": 1}, 60),
-    ({"total": 500, "fewest": 120, "tasks": 4}, 1024), ({"total": 500, "fewest": 500, "longest": 300}, 100),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("found", "taken"),
+    [
+        ({"total": 500, "fewest": 500, "tasks": 1}, 100),
+        ({"total": 60, "fewest": 60, "tasks": 1}, 60),
+        ({"total": 500, "fewest": 120, "tasks": 4}, 1024),
+        ({"total": 500, "fewest": 500, "longest": 300}, 100),
+    ],
+)
 def test_imagined_comparisons_begin_in_all_parts_of_a_dataset(
     found: dict[str, int], taken: int, tmp_path: Path
 ) -> None:
@@ -187,16 +199,29 @@ ALIKE = 11
 """Held-out episodes of a dataset that all succeed."""
 
 
-@pytest.mark.parametrize(("rollouts", "outcomes", "held_out", "root", "split"), [
-    (9, BOTH, 2, "data", "all"), (10, BOTH, 2, "rollouts", "all"), (10, BOTH, 10, "data", "validation"),
-    (200, BOTH, 10, "rollouts", "validation"), (200, EARLY, 2, "rollouts", "all"),
-    (200, EARLY, 10, "data", "validation"), (200, NEITHER, 2, "data", "all"),
-    (100, EARLY, ALIKE, "rollouts", "all"), (200, NEITHER, ALIKE, "data", "validation"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("rollouts", "outcomes", "held_out", "root", "split"),
+    [
+        (9, BOTH, 2, "data", "all"),
+        (10, BOTH, 2, "rollouts", "all"),
+        (10, BOTH, 10, "data", "validation"),
+        (200, BOTH, 10, "rollouts", "validation"),
+        (200, EARLY, 2, "rollouts", "all"),
+        (200, EARLY, 10, "data", "validation"),
+        (200, NEITHER, 2, "data", "all"),
+        (100, EARLY, ALIKE, "rollouts", "all"),
+        (200, NEITHER, ALIKE, "data", "validation"),
+    ],
+)
 def test_rollouts_are_checked_on_if_they_tell_more_than_the_dataset(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rollouts: int, outcomes: str, held_out: int, root: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    rollouts: int,
+    outcomes: str,
+    held_out: int,
+    root: str,
     split: str,
-) -> None:  # fmt: skip
+) -> None:
     number = np.arange(rollouts)
     success = {BOTH: (number + number // 20) % 2 == 0, EARLY: number > 9, NEITHER: number >= 0}[outcomes]
     table = SimpleNamespace(
@@ -227,11 +252,12 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
     config.rollouts, config.real_env, config.dataset.episodes = 2, PushtEnv(), [0, 3]
     before, cloned, ppo, distilled = improvement.policies.values()
     results = {
-        "finished": True, "policies": {"a": {"share": 0.1}, "b": {"share": 0.9}},
+        "finished": True,
+        "policies": {"a": {"share": 0.1}, "b": {"share": 0.9}},
         "pairs": [{"before": "a", "after": "b", "better": better and "b"}],
-    }  # fmt: skip
+    }
     write_json(folder / "start" / "comparison.json", results)
-    stages = iter(commands.stages(improvement))
+    stages = iter(list_stages(improvement))
     made = {stage.name: stage.command() for stage in islice(stages, 3)}
     success = read_episodes(make_synthetic_dataset(folder / "merged", episodes=6)).success
     made |= {stage.name: stage.command() for stage in stages}
@@ -267,17 +293,20 @@ def test_lerobot_edits_the_dataset_in_a_folder_with_any_name(tmp_path: Path) -> 
     numbers = dict.fromkeys(("observation.state", "action", "effort"), "float32")
     improvement = improvement_of(tmp_path, root=Path("2024_01_15"), columns=numbers)
     improvement.plan.config.rollouts, improvement.plan.config.real_env = 20, PushtEnv()
-    config = draccus.parse(EditDatasetConfig, args=commands.columns_command(improvement.plan)[1:])
+    config = draccus.parse(EditDatasetConfig, args=commands.columns_command(improvement)[1:])
     assert (config.root, config.operation.feature_names) == ("2024_01_15", ["effort"])
 
 
-@pytest.mark.parametrize(("real", "rollouts", "longest", "discount"), [
-    (None, 0, 40, 0.97),
-    (WmrlManiSkillEnv(task="push"), 300, 37, 0.97),
-    (PushtEnv(), 150, 150, 0.996),
-    (PushtEnv(), 0, 150, 0.992),
-    (None, 0, 5000, 0.999),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("real", "rollouts", "longest", "discount"),
+    [
+        (None, 0, 40, 0.97),
+        (WmrlManiSkillEnv(task="push"), 300, 37, 0.97),
+        (PushtEnv(), 150, 150, 0.996),
+        (PushtEnv(), 0, 150, 0.992),
+        (None, 0, 5000, 0.999),
+    ],
+)
 def test_the_discount_leaves_a_late_success_its_worth(
     real: EnvConfig | None, rollouts: int, longest: int, discount: float, tmp_path: Path
 ) -> None:
@@ -328,7 +357,7 @@ def test_rl_may_stop_by_its_own_rules_if_it_leaves_a_checkpoint(
     """After any other error it is tried again. No planner is fitted to this policy, which could go on."""
     improvement = improvement_of(tmp_path, policy=VQBeTConfig(device="cpu", pretrained_path=tmp_path))
     improvement.plan.config.real_env = real
-    (rl,) = (stage for stage in commands.stages(improvement) if stage.name == "rl")
+    (rl,) = (stage for stage in list_stages(improvement) if stage.name == "rl")
     for other in {"last", "best"} - {link}:
         (tmp_path / "rl" / "checkpoints" / other / "pretrained_model").mkdir(parents=True)
     assert not rl.optional(STOPPED)
@@ -358,7 +387,7 @@ def test_rl_that_left_nothing_leaves_the_policy_of_further_bc_to_the_planner(tmp
     """It may find what PPO's noise does not."""
     improvement = improvement_of(tmp_path, failures=10)
     assert [*improvement.policies] == [SFT, CLONED, PPO, DISTILLED]
-    (rl,) = (stage for stage in commands.stages(improvement) if stage.name == "rl")
+    (rl,) = (stage for stage in list_stages(improvement) if stage.name == "rl")
     assert rl.optional(STOPPED)
     write_json(tmp_path / "stages" / "rl.json", {"failed": "stopped: no episode was rewarded"})
     results = {"finished": True, "policies": {"a": {"share": 0.0}, "b": {"share": 0.0}}, "pairs": []}
@@ -374,7 +403,7 @@ def test_rl_that_left_nothing_leaves_the_policy_of_further_bc_to_the_planner(tmp
 def test_rl_that_left_nothing_leaves_a_policy_of_successes_to_the_planner(tmp_path: Path) -> None:
     """If the planner finds nothing either, there is nothing to compare."""
     improvement = improvement_of(tmp_path)
-    rl, distilled = (stage for stage in commands.stages(improvement) if stage.name in ("rl", "distilled"))
+    rl, distilled = (stage for stage in list_stages(improvement) if stage.name in ("rl", "distilled"))
     assert rl.optional(STOPPED)
     write_json(tmp_path / "stages" / "rl.json", {"failed": "stopped: no episode was rewarded"})
     assert f"--policy.path={improvement.plan.policy}" in distilled.command()
@@ -384,10 +413,17 @@ def test_rl_that_left_nothing_leaves_a_policy_of_successes_to_the_planner(tmp_pa
     assert distilled.optional(1)
 
 
-@pytest.mark.parametrize(("kind", "iterations", "freq"), [
-    (CnnConfig, 1, 1), (CnnConfig, 3, 1), (CnnConfig, 5, 2), (CnnConfig, 60, 15), (CnnConfig, None, 10),
-    (VQBeTConfig, None, 2),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("kind", "iterations", "freq"),
+    [
+        (CnnConfig, 1, 1),
+        (CnnConfig, 3, 1),
+        (CnnConfig, 5, 2),
+        (CnnConfig, 60, 15),
+        (CnnConfig, None, 10),
+        (VQBeTConfig, None, 2),
+    ],
+)
 def test_rl_is_measured_four_times_at_most(
     kind: type[PreTrainedConfig], iterations: int | None, freq: int, tmp_path: Path
 ) -> None:
@@ -402,26 +438,32 @@ def test_rl_is_measured_four_times_at_most(
     )
 
 
-@pytest.mark.parametrize(("kind", "names"), [
-    (CnnConfig, [SFT, PPO, DISTILLED]),
-    (ACTConfig, [SFT, FITTED]),
-    (VQBeTConfig, [SFT, FITTED]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [
+        (CnnConfig, [SFT, PPO, DISTILLED]),
+        (ACTConfig, [SFT, FITTED]),
+        (VQBeTConfig, [SFT, FITTED]),
+    ],
+)
 def test_only_policies_for_which_it_was_measured_are_fitted_to_a_planner_after_ppo(
     kind: type[PreTrainedConfig], names: list[str], tmp_path: Path
 ) -> None:
     improvement = improvement_of(tmp_path, policy=kind(device="cpu", pretrained_path=tmp_path))
     assert [*improvement.policies] == names
     improvement.plan.rl_checkpoint.mkdir(parents=True)
-    optional = [stage.name for stage in commands.stages(improvement) if stage.optional(1)]
+    optional = [stage.name for stage in list_stages(improvement) if stage.optional(1)]
     assert optional == (["distilled"] if DISTILLED in names else [])
     assert improvement.chosen() == names[-1]
 
 
-@pytest.mark.parametrize(("adapters", "pixels", "flags"), [
-    (False, 2 * 64**2, ["--batch_size=32"]),
-    (True, 480 * 640, ["--batch_size=27", "--peft.method_type=LORA"]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("adapters", "pixels", "flags"),
+    [
+        (False, 2 * 64**2, ["--batch_size=32"]),
+        (True, 480 * 640, ["--batch_size=27", "--peft.method_type=LORA"]),
+    ],
+)
 def test_cloning_suits_the_policy_and_its_frames(
     adapters: bool, pixels: int, flags: list[str], small_dataset: Any, tmp_path: Path
 ) -> None:
@@ -437,7 +479,7 @@ def test_cloning_suits_the_policy_and_its_frames(
 
 def test_a_run_that_selects_nothing_goes_on_where_there_was_no_selection(tmp_path: Path) -> None:
     improvement = improvement_of(tmp_path, failures=2)
-    given = settings(improvement.plan.config, commands.stages(improvement))
+    given = settings(improvement.plan.config, list_stages(improvement))
     older = {name: value for name, value in given.items() if name != "selection_episodes"}
     write_json(tmp_path / MARKER, older)
     with Claim(tmp_path, given, marker=MARKER).held():
@@ -447,7 +489,7 @@ def test_a_run_that_selects_nothing_goes_on_where_there_was_no_selection(tmp_pat
 def test_a_folder_that_was_begun_with_other_stages_is_refused(tmp_path: Path) -> None:
     """As by a version that did not clone."""
     improvement = improvement_of(tmp_path, failures=2)
-    given = settings(improvement.plan.config, commands.stages(improvement))
+    given = settings(improvement.plan.config, list_stages(improvement))
     write_json(tmp_path / MARKER, {**given, "stages": ["tokenizer", "world_model", "check", "rl"]})
     with pytest.raises(ValueError, match="stages"), Claim(tmp_path, given, marker=MARKER).held():
         pass

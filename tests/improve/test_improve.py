@@ -44,9 +44,15 @@ def arguments(folder: Path, demonstrations: Path, *flags: str) -> list[str]:
     if not policy.exists():
         save_untrained_policy(policy, OBS_IMAGE, size=96, actions=2, constant=250.0)
     return [
-        f"--policy.path={policy}", f"--dataset.root={demonstrations}", "--size=tiny", "--iterations=1",
-        "--selection_episodes=2", "--eval_episodes=2", f"--output_dir={folder / 'improve'}", *flags,
-    ]  # fmt: skip
+        f"--policy.path={policy}",
+        f"--dataset.root={demonstrations}",
+        "--size=tiny",
+        "--iterations=1",
+        "--selection_episodes=2",
+        "--eval_episodes=2",
+        f"--output_dir={folder / 'improve'}",
+        *flags,
+    ]
 
 
 def run(folder: Path, demonstrations: Path, *flags: str) -> subprocess.CompletedProcess[str]:
@@ -104,12 +110,27 @@ def test_its_world_model_plans_in_pusht(
     improved: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     world_model = improved[0] / "improve" / "world_model"
-    monkeypatch.setattr(sys, "argv", [
-        "lerobot-eval", "--policy.type=wm_mpc", f"--policy.world_model_path={world_model}",
-        "--policy.horizon=4", "--policy.knots=2", "--policy.execute=2", "--policy.samples=4",
-        "--policy.elites=2", "--policy.iterations=1", "--policy.done_frames=1", "--env.type=pusht",
-        "--env.episode_length=4", "--eval.n_episodes=1", "--eval.batch_size=1", f"--output_dir={tmp_path}",
-    ])  # fmt: skip
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        [
+            "lerobot-eval",
+            "--policy.type=wm_mpc",
+            f"--policy.world_model_path={world_model}",
+            "--policy.horizon=4",
+            "--policy.knots=2",
+            "--policy.execute=2",
+            "--policy.samples=4",
+            "--policy.elites=2",
+            "--policy.iterations=1",
+            "--policy.done_frames=1",
+            "--env.type=pusht",
+            "--env.episode_length=4",
+            "--eval.n_episodes=1",
+            "--eval.batch_size=1",
+            f"--output_dir={tmp_path}",
+        ],
+    )
     lerobot_eval.main()
     (found,) = json.loads((tmp_path / "eval_info.json").read_text())["per_task"]
     assert found["metrics"]["successes"] == [False]
@@ -119,13 +140,29 @@ def test_a_dyna_round_records_in_pusht(
     improved: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made, out = improved[0] / "improve", tmp_path / "rl"
-    monkeypatch.setattr(sys, "argv", [
-        "lerobot-wmrl-train", f"--policy.path={improved[0] / 'policy'}", "--env.type=world_model",
-        f"--env.world_model_path={made / 'world_model'}", f"--env.dataset.root={made / 'merged'}",
-        "--env.reward.type=general", "--env.reward.alpha=1", "--env.episode_length=3", "--iterations=2",
-        "--num_envs=2", "--gate.action=off", *PUSHT, "--dyna.rounds=1", "--dyna.n_episodes=2",
-        "--dyna.steps=1", "--dyna.batch_size=2", f"--output_dir={out}",
-    ])  # fmt: skip
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        [
+            "lerobot-wmrl-train",
+            f"--policy.path={improved[0] / 'policy'}",
+            "--env.type=world_model",
+            f"--env.world_model_path={made / 'world_model'}",
+            f"--env.dataset.root={made / 'merged'}",
+            "--env.reward.type=general",
+            "--env.reward.alpha=1",
+            "--env.episode_length=3",
+            "--iterations=2",
+            "--num_envs=2",
+            "--gate.action=off",
+            *PUSHT,
+            "--dyna.rounds=1",
+            "--dyna.n_episodes=2",
+            "--dyna.steps=1",
+            "--dyna.batch_size=2",
+            f"--output_dir={out}",
+        ],
+    )
     train.main()
     recorded = [read_episodes(open_dataset(out / "dyna" / "000001" / name)) for name in ("calm", "noisy")]
     assert [len(table.length) for table in recorded] == [1, 1]
@@ -150,33 +187,56 @@ def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, t
     assert "failures: 0. The world model will hardly tell them" in done.stdout
 
 
-@pytest.mark.parametrize(("flags", "message"), [
-    (["--rollouts=2"], "--rollouts=2: are recorded in a real environment; give --real_env.type"),
-    (["--real_env.type=pusht", "--rollouts=2", "--seed=949999"], "--seed=949999: must be from 0 to 949998"),
-    (["--max_frames=9"],
-     "--max_frames=9: limits rollouts in environments other than ManiSkill; leave it out"),
-    (["--max_frames=9", "--rollouts=2", "--real_env.type=wmrl_maniskill"],
-     "--max_frames=9: limits rollouts in environments other than ManiSkill; set --real_env.episode_length"),
-    (["--max_frames=0"], "--max_frames=0: must be at least 1"),
-    (["--iterations=0"], "--iterations=0: must be at least 1"),
-    (["--exploration=7"], "--exploration=7.0: must be between 0 and 1"),
-    (["--rollouts=2", "--real_env.type=wmrl_maniskill", "--real_env.split=ood"],
-     "--real_env.split=ood: results are reported on unseen scenes"),
-    (["--rollouts=2", "--real_env.type=wmrl_maniskill"],
-     "they could not be merged; record it with lerobot-wmrl-record, or leave --rollouts out"),
-    (["--seed=1000000"], "--seed=1000000: must be from 0 to 999999"),
-    (["--size=huge"], "--size=huge: choose one of auto, tiny, demo, cpu"),
-    (["--dataset.root=nowhere"], "no LeRobotDataset there"),
-    (["--real_env.type=wmrl_maniskill"],
-     "the policy needs observation.image, which real_env does not have"),
-    (["--real_env.type=wmrl_maniskill", "--real_env.task=push,lift"], "--real_env.task=lift: unknown"),
-    (["--real_env.type=pusht", "--real_env.obs_type=environment_state_agent_pos"],
-     "the policy needs observation.image, which real_env does not have"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--rollouts=2"], "--rollouts=2: are recorded in a real environment; give --real_env.type"),
+        (
+            ["--real_env.type=pusht", "--rollouts=2", "--seed=949999"],
+            "--seed=949999: must be from 0 to 949998",
+        ),
+        (
+            ["--max_frames=9"],
+            "--max_frames=9: limits rollouts in environments other than ManiSkill; leave it out",
+        ),
+        (
+            ["--max_frames=9", "--rollouts=2", "--real_env.type=wmrl_maniskill"],
+            "--max_frames=9: limits rollouts in environments other than ManiSkill; "
+            "set --real_env.episode_length",
+        ),
+        (["--max_frames=0"], "--max_frames=0: must be at least 1"),
+        (["--iterations=0"], "--iterations=0: must be at least 1"),
+        (["--exploration=7"], "--exploration=7.0: must be between 0 and 1"),
+        (
+            ["--rollouts=2", "--real_env.type=wmrl_maniskill", "--real_env.split=ood"],
+            "--real_env.split=ood: results are reported on unseen scenes",
+        ),
+        (
+            ["--rollouts=2", "--real_env.type=wmrl_maniskill"],
+            "they could not be merged; record it with lerobot-wmrl-record, or leave --rollouts out",
+        ),
+        (["--seed=1000000"], "--seed=1000000: must be from 0 to 999999"),
+        (["--size=huge"], "--size=huge: choose one of auto, tiny, demo, cpu"),
+        (["--dataset.root=nowhere"], "no LeRobotDataset there"),
+        (
+            ["--real_env.type=wmrl_maniskill"],
+            "the policy needs observation.image, which real_env does not have",
+        ),
+        (["--real_env.type=wmrl_maniskill", "--real_env.task=push,lift"], "--real_env.task=lift: unknown"),
+        (
+            ["--real_env.type=pusht", "--real_env.obs_type=environment_state_agent_pos"],
+            "the policy needs observation.image, which real_env does not have",
+        ),
+    ],
+)
 def test_bad_settings_are_named_and_nothing_is_made(
-    flags: list[str], message: str, demonstrations: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    flags: list[str],
+    message: str,
+    demonstrations: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     monkeypatch.setattr(sys, "argv", ["lerobot-wmrl-improve", *arguments(tmp_path, demonstrations, *flags)])
     with pytest.raises(SystemExit) as stopped:
         run_command(improve, ImproveConfig, list)
@@ -203,9 +263,11 @@ def test_a_dataset_that_has_changed_is_not_taken_for_the_one_before(
     shutil.copytree(demonstrations, root)
     policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2, constant=250.0)
     config = ImproveConfig(
-        policy=read_policy_config(str(policy), []), dataset=ChosenEpisodes(str(root)), size="tiny",
+        policy=read_policy_config(str(policy), []),
+        dataset=ChosenEpisodes(str(root)),
+        size="tiny",
         output_dir=tmp_path / "improve",
-    )  # fmt: skip
+    )
 
     def stop(*_: Any) -> None:
         raise KeyboardInterrupt

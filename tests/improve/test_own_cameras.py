@@ -21,10 +21,12 @@ from tests.rl.small_smolvla import save_small_smolvlm, small_smolvla
 TOP, WRIST = "observation.images.top", "observation.images.wrist"
 CAMERAS = [f"observation.images.camera{number}" for number in (1, 2, 3)]
 COLUMNS = {
-    **{name: {"dtype": "video", "shape": (48, 80, 3), "names": ["height", "width", "channels"]}
-       for name in (TOP, WRIST)},
+    **{
+        name: {"dtype": "video", "shape": (48, 80, 3), "names": ["height", "width", "channels"]}
+        for name in (TOP, WRIST)
+    },
     OBS_STATE: {"dtype": "float32", "shape": (7,)},
-}  # fmt: skip
+}
 SHOWN = {TOP: (3, 48, 80), WRIST: (3, 48, 80), OBS_STATE: (7,)}
 
 
@@ -34,9 +36,12 @@ def base(tmp_path: Path) -> SmolVLAPolicy:
     inputs = {name: PolicyFeature(FeatureType.VISUAL, (3, 256, 256)) for name in CAMERAS}
     inputs[OBS_STATE] = PolicyFeature(FeatureType.STATE, (6,))
     return small_smolvla(
-        save_small_smolvlm(tmp_path / "smolvlm"), device="cpu", empty_cameras=1, input_features=inputs,
+        save_small_smolvlm(tmp_path / "smolvlm"),
+        device="cpu",
+        empty_cameras=1,
+        input_features=inputs,
         output_features={ACTION: PolicyFeature(FeatureType.ACTION, (3,))},
-    )  # fmt: skip
+    )
 
 
 def fine_tuned(policy: Any, folder: Path, renames: dict[str, str]) -> Path:

@@ -28,6 +28,7 @@ from lerobot_wmrl.improve.report import figures
 from lerobot_wmrl.improve.report.curves import curve, lerobot_train_curve, training_curves
 from lerobot_wmrl.improve.report.page import Page
 from lerobot_wmrl.improve.report.words import compared, reservations, trust, verdict
+from lerobot_wmrl.improve.stages import list_stages
 from tests.experiments.typed import check
 from tests.improve.made_up import improvement_of
 
@@ -47,10 +48,18 @@ def finished(tmp_path: Path) -> Progress:
     for iteration, k in ((0, 5), (10, 8), (20, 6)):
         record = {"real": {"k": k, "n": 10}, "imagined": {"k": iteration // 2, "n": 10}}
         write_json(out / "rl" / "selection" / f"{iteration:06d}" / "record.json", record)
-    write_json(out / "check" / "metrics.json", {
-        "false_positives": 2, "failures": 5, "true_positives": 3, "successes": 4, "auc": 0.9,
-        "dataset": "data", "split": "validation",
-    })  # fmt: skip
+    write_json(
+        out / "check" / "metrics.json",
+        {
+            "false_positives": 2,
+            "failures": 5,
+            "true_positives": 3,
+            "successes": 4,
+            "auc": 0.9,
+            "dataset": "data",
+            "split": "validation",
+        },
+    )
     Image.new("RGB", (8, 8)).save(out / "check" / "comparison_success_strip.png")
     (out / "logs").mkdir()
     (out / "logs" / "cloned.log").write_text("INFO step:1 loss:2.0 \nINFO step:2 loss:1.0 \n")
@@ -62,11 +71,17 @@ def finished(tmp_path: Path) -> Progress:
 
 def write_records(improvement: Progress) -> None:
     """Write those of finished stages."""
-    for stage in commands.stages(improvement):
-        write_json(improvement.plan.out / "stages" / f"{stage.name}.json", {
-            "name": stage.name, "title": stage.title, "command": f"run-{stage.name}", "seconds": 3.0,
-            "peak_memory_bytes": 2e9,
-        })  # fmt: skip
+    for stage in list_stages(improvement):
+        write_json(
+            improvement.plan.out / "stages" / f"{stage.name}.json",
+            {
+                "name": stage.name,
+                "title": stage.title,
+                "command": f"run-{stage.name}",
+                "seconds": 3.0,
+                "peak_memory_bytes": 2e9,
+            },
+        )
 
 
 def comparison(successes: Sequence[int], starts: int = 40) -> dict[str, Any]:
@@ -102,7 +117,7 @@ def test_the_page_is_self_contained_and_says_the_numbers(finished: Progress) -> 
     )
     assert "RL&#39;s checkpoint is that of iteration 10: none succeeded more often in the real" in page
     assert "on starts set aside for this: 0: 50 % (5 of 10; 24–76 %), 10: 80 % (8 of 10; " in page
-    for stage in commands.stages(finished):
+    for stage in list_stages(finished):
         assert f"<pre>run-{stage.name}</pre>" in page
     assert page.count("data:image/png;base64,") == 8, "bars, the replayed episode, and six curves"
 
@@ -133,10 +148,17 @@ def test_failures_among_the_rollouts_count(finished: Progress, monkeypatch: pyte
 
 @pytest.mark.usefixtures("without_drawing")
 def test_a_planner_that_could_not_be_distilled_is_left_out(finished: Progress) -> None:
-    write_json(finished.plan.out / "stages" / "distilled.json", {
-        "name": "distilled", "title": "Fit", "command": "run", "seconds": 1.0, "peak_memory_bytes": 1e9,
-        "failed": True,
-    })  # fmt: skip
+    write_json(
+        finished.plan.out / "stages" / "distilled.json",
+        {
+            "name": "distilled",
+            "title": "Fit",
+            "command": "run",
+            "seconds": 1.0,
+            "peak_memory_bytes": 1e9,
+            "failed": True,
+        },
+    )
     write_json(finished.plan.out / "comparison" / "comparison.json", comparison([16, 24, 20]))
     write_json(finished.plan.out / "choice" / "comparison.json", comparison([10, 12, 13], 20))
     said = f"Fitting the policy to a planner failed ({finished.plan.out}/logs/distilled.log)"
@@ -255,15 +277,18 @@ def test_the_summary_holds_every_headline_number(finished: Progress) -> None:
     }
     assert summary["gate"] is None
     assert summary["chosen"] == DISTILLED
-    assert summary["seconds"] == 3.0 * len(commands.stages(finished))
+    assert summary["seconds"] == 3.0 * len(list_stages(finished))
 
 
 @pytest.mark.usefixtures("without_drawing")
-@pytest.mark.parametrize(("successes", "chosen"), [
-    ([10, 12, 13, 18], DISTILLED),
-    ([10, 12, 6, 12], CLONED),
-    ([13, 12, 6, 13], SFT),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("successes", "chosen"),
+    [
+        ([10, 12, 13, 18], DISTILLED),
+        ([10, 12, 6, 12], CLONED),
+        ([13, 12, 6, 13], SFT),
+    ],
+)
 def test_the_policy_to_use_is_the_best_one_on_other_starts(
     successes: list[int], chosen: str, finished: Progress
 ) -> None:

@@ -47,9 +47,11 @@ class Order:
     def config(self) -> RecordConfig:
         """Of the recording."""
         return RecordConfig(
-            Path(self.root) / "dataset", env=WmrlManiSkillEnv(image_size=64),
-            num_episodes=self.num_episodes, part_episodes=self.part_episodes,
-        )  # fmt: skip
+            Path(self.root) / "dataset",
+            env=WmrlManiSkillEnv(image_size=64),
+            num_episodes=self.num_episodes,
+            part_episodes=self.part_episodes,
+        )
 
     @property
     def work(self) -> Path:

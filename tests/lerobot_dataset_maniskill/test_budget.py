@@ -38,9 +38,12 @@ def ledger(tmp_path: Path) -> Ledger:
 
 def config(ledger: Ledger, name: str, episodes: int, **settings: Any) -> RecordConfig:
     options = {
-        "budget": ledger.path, "env": WmrlManiSkillEnv(image_size=32), "num_workers": 1,
-        "kinds": {"optimal": 1.0}, **settings,
-    }  # fmt: skip
+        "budget": ledger.path,
+        "env": WmrlManiSkillEnv(image_size=32),
+        "num_workers": 1,
+        "kinds": {"optimal": 1.0},
+        **settings,
+    }
     return RecordConfig(output_dir=ledger.path.parent / name, num_episodes=episodes, **options)
 
 
@@ -58,8 +61,10 @@ def test_a_recording_is_charged_and_reports_completion_again(
     with pytest.raises(FieldError, match="1 more demonstrations are wanted, 0 of 3 are left"):
         record(config(ledger, "more", 1, seed=100))
     assert {path.name for path in ledger.path.parent.iterdir()} == {
-        ledger.path.name, ".budget.json.lock", "planned",
-    }  # fmt: skip
+        ledger.path.name,
+        ".budget.json.lock",
+        "planned",
+    }
 
 
 def test_a_recording_that_was_killed_before_it_was_charged_is_charged(
@@ -115,9 +120,12 @@ def test_imagined_episodes_cost_nothing_and_start_in_known_ones(
 ) -> None:
     real = make_synthetic_dataset(tmp_path / "real", episodes=3)
     env = WorldModelEnv(
-        world_model_path=str(trained_models["action_world_model"]), dataset=StartFrames(root=str(real.root)),
-        reward=GeneralConfig(alpha=1.0), episode_length=4, device="cpu",
-    )  # fmt: skip
+        world_model_path=str(trained_models["action_world_model"]),
+        dataset=StartFrames(root=str(real.root)),
+        reward=GeneralConfig(alpha=1.0),
+        episode_length=4,
+        device="cpu",
+    )
     policy = read_policy_config(str(save_untrained_policy(tmp_path / "policy", actions=7)), [])
     imagined = config(ledger, "imagined", 3, env=env, policy=policy)
     with pytest.raises(FieldError, match=r"env\.dataset\.root=.*3 of 3 episodes are not in the budget"):

@@ -30,10 +30,13 @@ SIZE = 32
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Eight episodes of two tasks in two scenes; six are optimal."""
     config = RecordConfig(
-        output_dir=tmp_path_factory.mktemp("card") / "dataset", num_episodes=8, part_episodes=4,
-        tasks=["push", "move_to_aim"], kinds={"optimal": 3.0, "near_miss": 1.0},
+        output_dir=tmp_path_factory.mktemp("card") / "dataset",
+        num_episodes=8,
+        part_episodes=4,
+        tasks=["push", "move_to_aim"],
+        kinds={"optimal": 3.0, "near_miss": 1.0},
         env=WmrlManiSkillEnv(scenes=[2, 5], cameras=["third_view", "wrist"], image_size=SIZE),
-    )  # fmt: skip
+    )
     record_made_up(config)
     return config.root
 

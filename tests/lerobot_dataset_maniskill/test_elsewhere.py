@@ -48,9 +48,13 @@ def config(demonstrations: Path, tmp_path: Path) -> RecordConfig:
     """Three episodes in parts of two."""
     policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2, constant=250.0)
     return RecordConfig(
-        output_dir=tmp_path / "rollouts", env=PushtEnv(episode_length=STEPS), num_episodes=3,
-        part_episodes=2, policy=read_policy_config(str(policy), []), like=DatasetSource(str(demonstrations)),
-    )  # fmt: skip
+        output_dir=tmp_path / "rollouts",
+        env=PushtEnv(episode_length=STEPS),
+        num_episodes=3,
+        part_episodes=2,
+        policy=read_policy_config(str(policy), []),
+        like=DatasetSource(str(demonstrations)),
+    )
 
 
 def test_they_have_the_columns_of_the_demonstrations_and_can_be_merged(
@@ -310,13 +314,16 @@ def test_without_demonstrations_the_environment_says_what_the_actions_are(
     assert features[OBS_IMAGE]["dtype"] == "image"
 
 
-@pytest.mark.parametrize(("setting", "value", "message"), [
-    ("policy", None, "env.type=pusht: needs a policy"),
-    ("depth", True, "depth=True: can be chosen in ManiSkill alone"),
-    ("shard", "0/2", "shard=0/2: divides recordings in ManiSkill alone"),
-    ("max_frames", 0, "max_frames=0: must be at least 1"),
-    ("like", DatasetSource("nowhere"), r"^like\.root=nowhere: no LeRobotDataset there"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("setting", "value", "message"),
+    [
+        ("policy", None, "env.type=pusht: needs a policy"),
+        ("depth", True, "depth=True: can be chosen in ManiSkill alone"),
+        ("shard", "0/2", "shard=0/2: divides recordings in ManiSkill alone"),
+        ("max_frames", 0, "max_frames=0: must be at least 1"),
+        ("like", DatasetSource("nowhere"), r"^like\.root=nowhere: no LeRobotDataset there"),
+    ],
+)
 def test_bad_settings_are_named_and_nothing_is_left(
     setting: str, value: object, message: str, config: RecordConfig
 ) -> None:

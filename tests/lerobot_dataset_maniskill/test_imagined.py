@@ -39,14 +39,21 @@ def config(small_dataset, trained_models, tmp_path) -> RecordConfig:
     """Seven episodes, from six starts, in parts of three, of which none succeeds."""
     env = WorldModelEnv(
         world_model_path=str(trained_models["action_world_model"]),
-        dataset=StartFrames(root=str(Path(small_dataset.root))), reward=GeneralConfig(alpha=1.0),
-        episode_length=LENGTH, done_threshold=0.9999, done_frames=2, device="cpu",
-    )  # fmt: skip
+        dataset=StartFrames(root=str(Path(small_dataset.root))),
+        reward=GeneralConfig(alpha=1.0),
+        episode_length=LENGTH,
+        done_threshold=0.9999,
+        done_frames=2,
+        device="cpu",
+    )
     policy = save_untrained_policy(tmp_path / "policy", actions=7)
     return RecordConfig(
-        output_dir=tmp_path / "imagined", env=env, num_episodes=7, part_episodes=3,
+        output_dir=tmp_path / "imagined",
+        env=env,
+        num_episodes=7,
+        part_episodes=3,
         policy=read_policy_config(str(policy), []),
-    )  # fmt: skip
+    )
 
 
 def test_every_row_is_what_the_world_model_imagined(config, small_dataset):

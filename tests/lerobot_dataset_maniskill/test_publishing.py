@@ -23,9 +23,13 @@ from tests.lerobot_dataset_maniskill.made_up import ROWS, record_made_up
 NAME = "somebody/pushes"
 EPISODES = 3
 FLAGS = [
-    f"--num_episodes={EPISODES}", "--part_episodes=2", "--kinds={optimal: 2, near_miss: 1}",
-    "--env.type=wmrl_maniskill", "--env.image_size=32", "--env.cameras=[third_view,wrist]",
-]  # fmt: skip
+    f"--num_episodes={EPISODES}",
+    "--part_episodes=2",
+    "--kinds={optimal: 2, near_miss: 1}",
+    "--env.type=wmrl_maniskill",
+    "--env.image_size=32",
+    "--env.cameras=[third_view,wrist]",
+]
 
 LOAD = """
 import json, sys
@@ -59,10 +63,12 @@ def without_xet(monkeypatch: pytest.MonkeyPatch) -> None:
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the command would have recorded with `FLAGS`."""
     config = RecordConfig(
-        output_dir=tmp_path_factory.mktemp("recorded") / "dataset", num_episodes=EPISODES, part_episodes=2,
+        output_dir=tmp_path_factory.mktemp("recorded") / "dataset",
+        num_episodes=EPISODES,
+        part_episodes=2,
         kinds={"optimal": 2, "near_miss": 1},
         env=WmrlManiSkillEnv(image_size=32, cameras=["third_view", "wrist"]),
-    )  # fmt: skip
+    )
     record_made_up(config)
     return config.root
 
@@ -149,10 +155,13 @@ def test_files_of_an_earlier_recording_are_gone(hub: Hub, root: Path) -> None:
 
 
 @pytest.mark.usefixtures("without_xet")
-@pytest.mark.parametrize(("token", "message"), [
-    ("hf_unknown", r"push_to_hub=true: .* \(401, Invalid username or password\.\).*`hf auth login`"),
-    (READ_TOKEN, r"push_to_hub=true: .* \(403, .*`hf auth login`"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("token", "message"),
+    [
+        ("hf_unknown", r"push_to_hub=true: .* \(401, Invalid username or password\.\).*`hf auth login`"),
+        (READ_TOKEN, r"push_to_hub=true: .* \(403, .*`hf auth login`"),
+    ],
+)
 def test_without_permission_the_recording_stays_and_can_be_published_later(
     hub: Hub, root: Path, token: str, message: str
 ) -> None:
@@ -179,12 +188,15 @@ def test_what_is_public_is_not_called_private(hub: Hub, root: Path) -> None:
     assert list(hub.dataset(NAME).head) == [".gitattributes"]
 
 
-@pytest.mark.parametrize(("repo_id", "message"), [
-    (None, "called local/dataset; give its name on the hub, user/name, as `repo_id`"),
-    ("pushes", "called pushes; give its name"),
-    ("somebody/push/es", "repo_id=somebody/push/es"),
-    (NAME, "nobody is logged in to the hub here; run hf auth login"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("repo_id", "message"),
+    [
+        (None, "called local/dataset; give its name on the hub, user/name, as `repo_id`"),
+        ("pushes", "called pushes; give its name"),
+        ("somebody/push/es", "repo_id=somebody/push/es"),
+        (NAME, "nobody is logged in to the hub here; run hf auth login"),
+    ],
+)
 def test_what_cannot_be_published_is_refused_before_it_is_recorded(
     repo_id: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -27,15 +27,21 @@ def test_flags_stand_where_the_recipe_stood(recipe: Callable[[str], Path]) -> No
     path = recipe("num_episodes: 7\nenv: {type: wmrl_maniskill, cameras: [third_view, wrist]}\n")
     expanded = expand_recipes(["--seed=1", f"--recipe={path}", "--num_episodes=9"])
     assert expanded == [
-        "--seed=1", "--num_episodes=7", "--env.type=wmrl_maniskill",
-        "--env.cameras=[third_view,wrist]", "--num_episodes=9",
-    ]  # fmt: skip
+        "--seed=1",
+        "--num_episodes=7",
+        "--env.type=wmrl_maniskill",
+        "--env.cameras=[third_view,wrist]",
+        "--num_episodes=9",
+    ]
 
 
-@pytest.mark.parametrize("text", [
-    "policy: {path: /policy}\nenv: {type: pusht}\nlike: {root: /data}",
-    "policy: {type: wm_mpc, horizon: 8}\nenv: {type: world_model, world_model_path: /model}",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "text",
+    [
+        "policy: {path: /policy}\nenv: {type: pusht}\nlike: {root: /data}",
+        "policy: {type: wm_mpc, horizon: 8}\nenv: {type: world_model, world_model_path: /model}",
+    ],
+)
 def test_a_recipe_may_hold_any_flag_of_the_command(text: str, recipe: Callable[[str], Path]) -> None:
     assert recipe_flags(recipe(text))
 
@@ -60,12 +66,16 @@ def test_every_packaged_recipe_plans_only_what_training_may_see(size: str, tmp_p
     assert {plan.task for plan in plans} == set(config.recorded_tasks)
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("num_episode: 3", "the key num_episode is unknown; did you mean num_episodes?"),
-    ("env: {camera: [wrist]}", r"the key env\.camera is unknown; did you mean env\.cameras?"),
-    ("frobnicate: 1", "the key frobnicate is unknown; choose from"),
-    ("- 1", "must hold"), ("a: [1", "cannot be read"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("num_episode: 3", "the key num_episode is unknown; did you mean num_episodes?"),
+        ("env: {camera: [wrist]}", r"the key env\.camera is unknown; did you mean env\.cameras?"),
+        ("frobnicate: 1", "the key frobnicate is unknown; choose from"),
+        ("- 1", "must hold"),
+        ("a: [1", "cannot be read"),
+    ],
+)
 def test_what_is_wrong_is_named(text: str, message: str, recipe: Callable[[str], Path]) -> None:
     with pytest.raises(ValueError, match=message):
         recipe_flags(recipe(text))

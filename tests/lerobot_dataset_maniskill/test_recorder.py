@@ -47,9 +47,15 @@ def config(root: Path, **fields: object) -> RecordConfig:
 
 def start_and_kill(root: Path, reached: str) -> Path:
     """Start the command, `kill -9` it once a file like `reached` exists. → its folder of unfinished work"""
-    flags = [f"--num_episodes={EPISODES}", f"--part_episodes={PART}", "--num_workers=2",
-             f"--kinds={json.dumps(KIND_SHARES)}", "--env.type=wmrl_maniskill", "--env.image_size=64",
-             f"--output_dir={root / 'dataset'}"]  # fmt: skip
+    flags = [
+        f"--num_episodes={EPISODES}",
+        f"--part_episodes={PART}",
+        "--num_workers=2",
+        f"--kinds={json.dumps(KIND_SHARES)}",
+        "--env.type=wmrl_maniskill",
+        "--env.image_size=64",
+        f"--output_dir={root / 'dataset'}",
+    ]
     command = subprocess.Popen([sys.executable, "-m", "lerobot_dataset_maniskill.record", *flags])
     work = root / ".dataset.recording"
     deadline = time.monotonic() + PATIENCE_S

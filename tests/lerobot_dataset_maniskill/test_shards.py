@@ -48,12 +48,15 @@ def test_a_complete_set_may_come_in_any_order() -> None:
     check_set(NAMES, contents((2, 3), (0, 3), (1, 3)))
 
 
-@pytest.mark.parametrize(("described", "message"), [
-    (contents((0, 3), (1, 3)), "missing: 2/3"),
-    (contents((0, 3), (1, 3), (1, 3)), "twice: 1/3; missing: 2/3"),
-    (contents((0, 2), (1, 2), seed=7), r"b: belongs to another recording than a \(seed 0 → 7\)"),
-    (contents((0, 2), (1, 3)), r"b: belongs to another recording than a \(another number of shards\)"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("described", "message"),
+    [
+        (contents((0, 3), (1, 3)), "missing: 2/3"),
+        (contents((0, 3), (1, 3), (1, 3)), "twice: 1/3; missing: 2/3"),
+        (contents((0, 2), (1, 2), seed=7), r"b: belongs to another recording than a \(seed 0 → 7\)"),
+        (contents((0, 2), (1, 3)), r"b: belongs to another recording than a \(another number of shards\)"),
+    ],
+)
 def test_what_is_no_set_is_named(described: list[dict[str, object]], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         check_set(NAMES[: len(described)], described)

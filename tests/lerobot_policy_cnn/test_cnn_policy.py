@@ -179,9 +179,14 @@ def test_a_policy_that_is_cloned_further_does_not_blow_up_constants_either(
 ) -> None:
     """lerobot-train then gives a checkpoint's processors the statistics of its dataset."""
     data = [
-        "--dataset.repo_id=local/synthetic", f"--dataset.root={small_dataset.root}", "--steps=1",
-        "--batch_size=2", "--num_workers=0", "--env_eval_freq=0", "--policy.push_to_hub=false",
-    ]  # fmt: skip
+        "--dataset.repo_id=local/synthetic",
+        f"--dataset.root={small_dataset.root}",
+        "--steps=1",
+        "--batch_size=2",
+        "--num_workers=0",
+        "--env_eval_freq=0",
+        "--policy.push_to_hub=false",
+    ]
     first, further = tmp_path / "first", tmp_path / "further"
     run_here("lerobot-train", "--policy.type=cnn", "--policy.device=cpu", *data, f"--output_dir={first}")
     run_here("lerobot-train", f"--policy.path={first / TRAINED}", *data, f"--output_dir={further}")
@@ -252,9 +257,13 @@ def test_a_random_shift_moves_images_by_whole_pixels() -> None:
     assert len({move[0] for move in moves}) > 10
 
 
-@pytest.mark.parametrize(("settings", "message"), [
-    ({"initial_std": 1.5}, "initial_std=1.5"), ({"n_obs_steps": 2}, "n_obs_steps=2"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"initial_std": 1.5}, "initial_std=1.5"),
+        ({"n_obs_steps": 2}, "n_obs_steps=2"),
+    ],
+)
 def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         CnnConfig(device="cpu", **settings)

@@ -159,21 +159,27 @@ def set_config(**changes: Any) -> Callable[[Path], None]:
     return change
 
 
-@pytest.mark.parametrize(("damage", "message"), [
-    (drop_weight, rf"the weight {WEIGHT} is missing"),
-    (drop_shard, r"model-00002-of-\d+\.safetensors: this file of weights is missing"),
-    (drop_from_shard, rf"safetensors: lacks {WEIGHT}, which model\.safetensors\.index\.json"),
-    (tear, r"model\.safetensors: cannot be read"),
-    (reshape, rf"the weight {WEIGHT} is \(47, 32\), expected \(48, 32\)"),
-    (add_weight, "the weight extra is unknown"),
-    (lambda folder: (folder / "model.safetensors").unlink(), r"model\.safetensors: this file .* missing"),
-    (lambda folder: (folder / "config.json").unlink(), r"config\.json is missing"),
-    (lambda folder: (folder / "tokenizer.json").unlink(), r"tokenizer\.json is missing"),
-    (set_config(image_resize_strategy="letterbox"), "image_resize_strategy=letterbox: only resize-naive"),
-    (set_config(use_fused_vision_backbone=False), "use_fused_vision_backbone=False: only True"),
-    (set_config(n_action_bins=128), "n_action_bins=128: only 256"),
-    (set_config(image_sizes=[40, 40]), r"image_sizes=\[40, 40\]: the weights are for pictures of 32 pixels"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (drop_weight, rf"the weight {WEIGHT} is missing"),
+        (drop_shard, r"model-00002-of-\d+\.safetensors: this file of weights is missing"),
+        (drop_from_shard, rf"safetensors: lacks {WEIGHT}, which model\.safetensors\.index\.json"),
+        (tear, r"model\.safetensors: cannot be read"),
+        (reshape, rf"the weight {WEIGHT} is \(47, 32\), expected \(48, 32\)"),
+        (add_weight, "the weight extra is unknown"),
+        (lambda folder: (folder / "model.safetensors").unlink(), r"model\.safetensors: this file .* missing"),
+        (lambda folder: (folder / "config.json").unlink(), r"config\.json is missing"),
+        (lambda folder: (folder / "tokenizer.json").unlink(), r"tokenizer\.json is missing"),
+        (set_config(image_resize_strategy="letterbox"), "image_resize_strategy=letterbox: only resize-naive"),
+        (set_config(use_fused_vision_backbone=False), "use_fused_vision_backbone=False: only True"),
+        (set_config(n_action_bins=128), "n_action_bins=128: only 256"),
+        (
+            set_config(image_sizes=[40, 40]),
+            r"image_sizes=\[40, 40\]: the weights are for pictures of 32 pixels",
+        ),
+    ],
+)
 def test_a_damaged_checkpoint_is_refused(
     checkpoint: Path, damage: Callable[[Path], None], message: str
 ) -> None:

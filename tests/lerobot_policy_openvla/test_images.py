@@ -9,9 +9,19 @@ from lerobot_policy_openvla.images import resize, to_pixel_values
 
 
 @pytest.mark.parametrize("size", [224, 64, 56])
-@pytest.mark.parametrize(("height", "width"), [
-    (256, 256), (480, 640), (64, 64), (31, 47), (1, 1), (225, 223), (2, 500), (720, 1280),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("height", "width"),
+    [
+        (256, 256),
+        (480, 640),
+        (64, 64),
+        (31, 47),
+        (1, 1),
+        (225, 223),
+        (2, 500),
+        (720, 1280),
+    ],
+)
 def test_resizing_is_pillows_bit_by_bit(height: int, width: int, size: int) -> None:
     """Hard edges too, where the filter overshoots and is clipped."""
     picture = np.random.default_rng(height).integers(0, 256, (height, width, 3), dtype=np.uint8)
@@ -36,10 +46,15 @@ def test_the_two_halves_are_one_picture_normalised_twice() -> None:
     assert torch.allclose(dino * std + mean, siglip * 0.5 + 0.5, atol=1e-6)
 
 
-@pytest.mark.parametrize("images", [
-    torch.zeros(3, 32, 32), torch.zeros(2, 32, 32, 3), torch.zeros(1, 1, 32, 32),
-    torch.zeros(1, 3, 32, 32, dtype=torch.int64),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "images",
+    [
+        torch.zeros(3, 32, 32),
+        torch.zeros(2, 32, 32, 3),
+        torch.zeros(1, 1, 32, 32),
+        torch.zeros(1, 3, 32, 32, dtype=torch.int64),
+    ],
+)
 def test_what_is_no_batch_of_pictures_is_refused(images: torch.Tensor) -> None:
     with pytest.raises(ValueError, match=r"needs \(B, 3, H, W\), torch\.uint8 or floating"):
         to_pixel_values(images, 32)

@@ -52,12 +52,16 @@ def test_a_weight_without_which_nothing_is_known_is_named() -> None:
         sizes_from_weights(shapes, {}, {})
 
 
-@pytest.mark.parametrize(("sizes", "settings", "message"), [
-    (ViTSizes, {"depth": 1}, "depth=1"), (ViTSizes, {"width": 30, "heads": 4}, "width=30"),
-    (Sizes, {"image_size": 60, "patch_size": 8}, "image_size=60"),
-    (LlamaSizes, {"width": 36, "heads": 4}, r"sizes\.llama\.width=36: .* twice heads=4"),
-    (LlamaSizes, {"width": 48, "heads": 6, "kv_heads": 4}, r"sizes\.llama\.heads=6: .* kv_heads=4"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("sizes", "settings", "message"),
+    [
+        (ViTSizes, {"depth": 1}, "depth=1"),
+        (ViTSizes, {"width": 30, "heads": 4}, "width=30"),
+        (Sizes, {"image_size": 60, "patch_size": 8}, "image_size=60"),
+        (LlamaSizes, {"width": 36, "heads": 4}, r"sizes\.llama\.width=36: .* twice heads=4"),
+        (LlamaSizes, {"width": 48, "heads": 6, "kv_heads": 4}, r"sizes\.llama\.heads=6: .* kv_heads=4"),
+    ],
+)
 def test_impossible_sizes_are_named(sizes: Any, settings: dict[str, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         sizes(**settings)

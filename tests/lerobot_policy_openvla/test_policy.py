@@ -181,21 +181,31 @@ def test_a_cpu_without_bfloat16_says_so(monkeypatch: pytest.MonkeyPatch) -> None
     assert compute_dtype("auto", "cpu") == torch.float32
 
 
-@pytest.mark.parametrize(("settings", "message"), [
-    ({"dtype": "float16"}, "dtype=float16: choose one of auto"), ({"temperature": 0.0}, r"temperature=0\.0"),
-    ({"n_obs_steps": 2}, "n_obs_steps=2"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"dtype": "float16"}, "dtype=float16: choose one of auto"),
+        ({"temperature": 0.0}, r"temperature=0\.0"),
+        ({"n_obs_steps": 2}, "n_obs_steps=2"),
+    ],
+)
 def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         small_config(**settings)
 
 
-@pytest.mark.parametrize(("observation", "message"), [
-    ({"observation.images.wrist": torch.zeros(1, 3, 8, 8), "task": ["x"]}, "third_view, the environment or"),
-    ({CAMERA: torch.zeros(1, 3, 8, 8)}, "needs one instruction per image, 1; there are none"),
-    ({CAMERA: torch.zeros(1, 3, 8, 8), "task": ["x", "y"]}, "there are 2"),
-    ({CAMERA: torch.zeros(1, 8, 8, 3), "task": ["x"]}, r"the policy needs \(B, 3, H, W\)"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("observation", "message"),
+    [
+        (
+            {"observation.images.wrist": torch.zeros(1, 3, 8, 8), "task": ["x"]},
+            "third_view, the environment or",
+        ),
+        ({CAMERA: torch.zeros(1, 3, 8, 8)}, "needs one instruction per image, 1; there are none"),
+        ({CAMERA: torch.zeros(1, 3, 8, 8), "task": ["x", "y"]}, "there are 2"),
+        ({CAMERA: torch.zeros(1, 8, 8, 3), "task": ["x"]}, r"the policy needs \(B, 3, H, W\)"),
+    ],
+)
 def test_observations_that_lack_something_are_refused(observation: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         small_policy().select_action(observation)

@@ -16,8 +16,12 @@ def prompts() -> PromptTokenizer:
 def test_a_tokenizer_made_from_instructions_has_llamas_layout(prompts: PromptTokenizer) -> None:
     tokenizer = prompts.tokenizer
     assert [tokenizer.id_to_token(index) for index in (0, 1, 2, 3, 258)] == [
-        "<unk>", "<s>", "</s>", "<0x00>", "<0xFF>",
-    ]  # fmt: skip
+        "<unk>",
+        "<s>",
+        "</s>",
+        "<0x00>",
+        "<0xFF>",
+    ]
     assert tokenizer.token_to_id("<PAD>") == 1024
     actions = [tokenizer.id_to_token(index) for index in range(768, 1024)]
     assert all(len(token) == 1 for token in actions)

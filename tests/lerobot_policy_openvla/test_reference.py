@@ -19,8 +19,10 @@ FEATURES, LOGITS, ACTIONS = 5e-5, 2e-4, 1e-6
 
 KEYS = ("bridge_orig", "fractal20220817_data", "legacy_no_mask", "toy_8d")
 INSTRUCTIONS = (
-    "pick up the red block", "put the carrot on the yellow plate next to the spoon", "close the drawer",
-)  # fmt: skip
+    "pick up the red block",
+    "put the carrot on the yellow plate next to the spoon",
+    "close the drawer",
+)
 
 
 def pixels(reference: Reference, sample: int) -> Tensor:

@@ -43,9 +43,14 @@ from tests.rl.point_env import PointEnv
 
 ADAPTERS = "adapter_model.safetensors"
 SHORT = [
-    "--algorithm.type=ppo", "--num_envs=2", "--iterations=3", "--save_freq=1",
-    "--algorithm.value_iterations=1", "--algorithm.minibatch_size=4", "--algorithm.policy_lr=1e-2",
-]  # fmt: skip
+    "--algorithm.type=ppo",
+    "--num_envs=2",
+    "--iterations=3",
+    "--save_freq=1",
+    "--algorithm.value_iterations=1",
+    "--algorithm.minibatch_size=4",
+    "--algorithm.policy_lr=1e-2",
+]
 LAST = Path("checkpoints/last/pretrained_model")
 
 
@@ -100,11 +105,21 @@ def tuned(base: Path, small_dataset: LeRobotDataset, tmp_path_factory: pytest.Te
     """The output folder of four steps of lerobot-train with LoRA."""
     output_dir = tmp_path_factory.mktemp("tuned") / "sft"
     run_here(
-        "lerobot-train", f"--policy.path={base}", "--policy.push_to_hub=false", "--policy.device=cpu",
-        "--peft.method_type=LORA", "--peft.r=4", "--peft.lora_alpha=8", "--dataset.repo_id=local/synthetic",
-        f"--dataset.root={small_dataset.root}", "--steps=4", "--batch_size=4", "--num_workers=0",
-        "--env_eval_freq=0", f"--output_dir={output_dir}",
-    )  # fmt: skip
+        "lerobot-train",
+        f"--policy.path={base}",
+        "--policy.push_to_hub=false",
+        "--policy.device=cpu",
+        "--peft.method_type=LORA",
+        "--peft.r=4",
+        "--peft.lora_alpha=8",
+        "--dataset.repo_id=local/synthetic",
+        f"--dataset.root={small_dataset.root}",
+        "--steps=4",
+        "--batch_size=4",
+        "--num_workers=0",
+        "--env_eval_freq=0",
+        f"--output_dir={output_dir}",
+    )
     return output_dir
 
 
@@ -130,9 +145,11 @@ def test_adapters_are_trained_further_as_the_command_improve_does_it(
     tuned: Path, small_dataset: LeRobotDataset, tmp_path: Path
 ) -> None:
     config = ImproveConfig(
-        policy=read_policy_config(str(tuned), []), dataset=ChosenEpisodes(str(small_dataset.root)),
-        size="tiny", output_dir=tmp_path,
-    )  # fmt: skip
+        policy=read_policy_config(str(tuned), []),
+        dataset=ChosenEpisodes(str(small_dataset.root)),
+        size="tiny",
+        output_dir=tmp_path,
+    )
     found = inspect_dataset(read_episodes(small_dataset), config.policy, None)
     command = commands_of(Progress(Plan(config, found)), "cloned")["cloned"]
     run_here(*command, "--policy.device=cpu", "--steps=2", "--save_freq=2")
@@ -162,10 +179,16 @@ def test_improve_reload_and_evaluate(tuned: Path, tmp_path: Path, monkeypatch: p
     assert torch.equal(lerobots.value(observe()), improved.value(observe()))
     assert not torch.equal(improved.value(observe()), load(tuned).value(observe()))
     run_here(
-        "lerobot-eval", f"--policy.path={tmp_path / 'rl' / LAST}", "--env.type=wmrl_maniskill",
-        "--env.image_size=32", "--env.episode_length=4", "--eval.n_episodes=1", "--eval.batch_size=1",
-        "--seed=1000000", f"--output_dir={tmp_path / 'eval'}",
-    )  # fmt: skip
+        "lerobot-eval",
+        f"--policy.path={tmp_path / 'rl' / LAST}",
+        "--env.type=wmrl_maniskill",
+        "--env.image_size=32",
+        "--env.episode_length=4",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        "--seed=1000000",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
     assert "pc_success" in json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]
 
 
@@ -185,15 +208,28 @@ def test_an_interrupted_training_of_adapters_ends_as_if_nothing_had_happened(
 
 @pytest.mark.parametrize("ratio", ["action", "token"])
 def test_adapters_are_improved_in_the_world_model(
-    tuned: Path, trained_models: dict[str, Path], small_dataset: LeRobotDataset, ratio: str, tmp_path: Path,
+    tuned: Path,
+    trained_models: dict[str, Path],
+    small_dataset: LeRobotDataset,
+    ratio: str,
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     improve(
-        monkeypatch, tuned, tmp_path, f"--env.world_model_path={trained_models['action_world_model']}",
-        "--env.reward.type=general", "--env.reward.alpha=1", f"--env.dataset.root={small_dataset.root}",
-        "--env.episode_length=3", "--iterations=2", f"--algorithm.ratio={ratio}", "--gate.action=off",
-        "--algorithm.target_kl=1", env="world_model",
-    )  # fmt: skip
+        monkeypatch,
+        tuned,
+        tmp_path,
+        f"--env.world_model_path={trained_models['action_world_model']}",
+        "--env.reward.type=general",
+        "--env.reward.alpha=1",
+        f"--env.dataset.root={small_dataset.root}",
+        "--env.episode_length=3",
+        "--iterations=2",
+        f"--algorithm.ratio={ratio}",
+        "--gate.action=off",
+        "--algorithm.target_kl=1",
+        env="world_model",
+    )
     lines = read_metrics(tmp_path)
     assert lines[1]["first_ratio_error"] < 1e-3
     assert lines[1]["kl"] > 0
@@ -210,9 +246,13 @@ def test_the_reference_shares_what_is_frozen(tuned: Path) -> None:
 
 @pytest.mark.parametrize("new", [False, True])
 def test_adapters_of_a_policy_that_others_lack_are_not_published(
-    new: bool, base: Path, tuned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    new: bool,
+    base: Path,
+    tuned: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     """They would name a folder of this machine; said before anything is trained."""
     flags = ["--policy.push_to_hub=true", "--policy.repo_id=me/adapters", *(["--peft.r=2"] if new else [])]
     with pytest.raises(SystemExit):

@@ -38,9 +38,17 @@ def test_the_planner_finds_the_sequence_that_is_wanted():
 
     low, high = torch.full((2,), -1.0), torch.ones(2)
     found, mean = plan_knots(
-        value, torch.zeros(1, 4, 2), torch.ones(2), low, high, horizon=12, samples=64, elites=8,
-        iterations=12, generator=torch.Generator().manual_seed(0),
-    )  # fmt: skip
+        value,
+        torch.zeros(1, 4, 2),
+        torch.ones(2),
+        low,
+        high,
+        horizon=12,
+        samples=64,
+        elites=8,
+        iterations=12,
+        generator=torch.Generator().manual_seed(0),
+    )
     actions = interpolate_knots(found, 12)
     assert (actions[0] - wanted).abs().max() < 0.1
     assert (interpolate_knots(mean, 12)[0] - wanted).abs().max() < 0.1
@@ -55,9 +63,17 @@ def test_searches_at_once_find_what_each_wants():
 
     low, high = torch.full((1,), -1.0), torch.ones(1)
     found, _ = plan_knots(
-        value, torch.zeros(3, 4, 1), torch.ones(1), low, high, horizon=8, samples=64, elites=8,
-        iterations=12, generator=torch.Generator().manual_seed(0),
-    )  # fmt: skip
+        value,
+        torch.zeros(3, 4, 1),
+        torch.ones(1),
+        low,
+        high,
+        horizon=8,
+        samples=64,
+        elites=8,
+        iterations=12,
+        generator=torch.Generator().manual_seed(0),
+    )
     assert (found - wanted[:, None, None]).abs().max() < 0.1
 
 
@@ -71,9 +87,17 @@ def test_the_planner_keeps_to_the_box_and_never_returns_worse_than_it_was_given(
 
     mean = torch.full((2, 3, 1), 0.1)
     found, _ = plan_knots(
-        value, mean, torch.ones(1), low, high, horizon=6, samples=16, elites=4, iterations=3,
+        value,
+        mean,
+        torch.ones(1),
+        low,
+        high,
+        horizon=6,
+        samples=16,
+        elites=4,
+        iterations=3,
         generator=torch.Generator().manual_seed(0),
-    )  # fmt: skip
+    )
     assert torch.equal(found, mean)
     assert torch.cat(asked).min() >= low - 1e-6
     assert torch.cat(asked).max() <= high + 1e-6
@@ -82,9 +106,17 @@ def test_the_planner_keeps_to_the_box_and_never_returns_worse_than_it_was_given(
 def test_where_all_is_equally_good_the_first_mean_is_kept_within_the_bounds():
     mean = torch.tensor([[[0.0], [2.0]]])
     found, _ = plan_knots(
-        lambda actions: torch.zeros(len(actions)), mean, torch.ones(1), -torch.ones(1), torch.ones(1),
-        horizon=4, samples=16, elites=4, iterations=3, generator=torch.Generator().manual_seed(0),
-    )  # fmt: skip
+        lambda actions: torch.zeros(len(actions)),
+        mean,
+        torch.ones(1),
+        -torch.ones(1),
+        torch.ones(1),
+        horizon=4,
+        samples=16,
+        elites=4,
+        iterations=3,
+        generator=torch.Generator().manual_seed(0),
+    )
     assert torch.equal(found, mean.clamp(max=1))
 
 
@@ -148,8 +180,9 @@ def test_success_after_the_end_of_the_episode_does_not_count(left, best):
 def config(trained_models) -> WmMpcConfig:
     return WmMpcConfig(
         world_model_path=str(trained_models["action_world_model"]),
-        text_world_model_path=str(trained_models["text_world_model"]), **SMALL,
-    )  # fmt: skip
+        text_world_model_path=str(trained_models["text_world_model"]),
+        **SMALL,
+    )
 
 
 def observation(small_dataset, rows: list[int]) -> dict:
@@ -190,12 +223,25 @@ def test_episodes_that_begin_alike_are_planned_alike(config, small_dataset):
 def test_lerobot_eval_runs_it_in_imagination(config, trained_models, small_dataset, tmp_path, monkeypatch):
     given = [f"--policy.{name}={value}" for name, value in SMALL.items()]
     path = trained_models["action_world_model"]
-    monkeypatch.setattr(sys, "argv", [
-        "lerobot-eval", "--policy.type=wm_mpc", f"--policy.world_model_path={path}", *given,
-        "--env.type=world_model", f"--env.world_model_path={path}", "--env.reward.type=general",
-        "--env.reward.alpha=1", f"--env.dataset.root={Path(small_dataset.root)}", "--env.episode_length=5",
-        "--eval.n_episodes=2", "--eval.batch_size=2", f"--output_dir={tmp_path}",
-    ])  # fmt: skip
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        [
+            "lerobot-eval",
+            "--policy.type=wm_mpc",
+            f"--policy.world_model_path={path}",
+            *given,
+            "--env.type=world_model",
+            f"--env.world_model_path={path}",
+            "--env.reward.type=general",
+            "--env.reward.alpha=1",
+            f"--env.dataset.root={Path(small_dataset.root)}",
+            "--env.episode_length=5",
+            "--eval.n_episodes=2",
+            "--eval.batch_size=2",
+            f"--output_dir={tmp_path}",
+        ],
+    )
     lerobot_eval.main()
     found = json.loads((tmp_path / "eval_info.json").read_text())
     assert len(found["per_task"][0]["metrics"]["successes"]) == 2
@@ -215,10 +261,13 @@ def test_bad_settings_name_the_field_and_the_remedy(trained_models):
         WmMpcConfig(device="cpu", knots=1)
 
 
-@pytest.mark.parametrize(("settings", "message"), [
-    ({"learnt_successes": 0}, "has learnt from no successful episode"),
-    ({"dynamics": AutoregressiveConfig(depth=True)}, "looks at depth, which environments do not show"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"learnt_successes": 0}, "has learnt from no successful episode"),
+        ({"dynamics": AutoregressiveConfig(depth=True)}, "looks at depth, which environments do not show"),
+    ],
+)
 def test_a_world_model_in_which_nothing_can_be_planned_is_refused(config, settings, message, monkeypatch):
     class Loaded:
         config = ActionWorldModelConfig(**settings)

@@ -66,8 +66,11 @@ def make_robot(small_dataset, trained_models, tmp_path) -> Callable[..., Imagine
         config = ImaginedRobotConfig(
             world_model_path=str(trained_models["action_world_model"]),
             dataset=StartFrames(root=str(small_dataset.root)),
-            calibration_dir=tmp_path / FOLDER, done_frames=1000, device="cpu", **settings,
-        )  # fmt: skip
+            calibration_dir=tmp_path / FOLDER,
+            done_frames=1000,
+            device="cpu",
+            **settings,
+        )
         robot = make_robot_from_config(config)
         robot.connect()
         return robot
@@ -78,19 +81,27 @@ def make_robot(small_dataset, trained_models, tmp_path) -> Callable[..., Imagine
 @pytest.fixture
 def flags(small_dataset, trained_models, tmp_path) -> list[str]:
     return [
-        "--robot.type=imagined", f"--robot.world_model_path={trained_models['action_world_model']}",
-        f"--robot.dataset.root={small_dataset.root}", "--robot.done_frames=1000", "--robot.device=cpu",
-        f"--robot.calibration_dir={tmp_path / FOLDER}", "--play_sounds=false",
-    ]  # fmt: skip
+        "--robot.type=imagined",
+        f"--robot.world_model_path={trained_models['action_world_model']}",
+        f"--robot.dataset.root={small_dataset.root}",
+        "--robot.done_frames=1000",
+        "--robot.device=cpu",
+        f"--robot.calibration_dir={tmp_path / FOLDER}",
+        "--play_sounds=false",
+    ]
 
 
 def recording(folder: Path, seconds: float, episodes: int) -> list[str]:
     return [
-        "--dataset.repo_id=local/driven", f"--dataset.root={folder}", "--dataset.single_task=push",
-        f"--dataset.num_episodes={episodes}", f"--dataset.episode_time_s={seconds}",
+        "--dataset.repo_id=local/driven",
+        f"--dataset.root={folder}",
+        "--dataset.single_task=push",
+        f"--dataset.num_episodes={episodes}",
+        f"--dataset.episode_time_s={seconds}",
         "--dataset.reset_time_s=0",
-        "--dataset.push_to_hub=false", "--dataset.video=false",
-    ]  # fmt: skip
+        "--dataset.push_to_hub=false",
+        "--dataset.video=false",
+    ]
 
 
 def run(command: Callable[[], Any], monkeypatch: pytest.MonkeyPatch, *given: str) -> None:
@@ -129,9 +140,14 @@ def test_lerobot_record_writes_imagined_episodes_from_one_start_after_the_other(
 ):
     folder = tmp_path / "driven"
     run(
-        record, monkeypatch, *flags, *recording(folder, 0.5, 2), f"--dataset.fps={FPS}",
-        "--robot.episode_time_s=0.5", "--teleop.type=scripted",
-    )  # fmt: skip
+        record,
+        monkeypatch,
+        *flags,
+        *recording(folder, 0.5, 2),
+        f"--dataset.fps={FPS}",
+        "--robot.episode_time_s=0.5",
+        "--teleop.type=scripted",
+    )
     dataset, table = open_dataset(folder), read_episodes(small_dataset)
     found = read_episodes(dataset)
     assert len(found.length) == 2
@@ -151,17 +167,24 @@ def test_lerobot_replay_repeats_a_recorded_episode(flags, small_dataset, monkeyp
 
     monkeypatch.setattr(ImaginedRobot, "disconnect", disconnect)
     run(
-        replay, monkeypatch, *flags, "--robot.first_start=1", "--dataset.repo_id=local/synthetic",
-        f"--dataset.root={small_dataset.root}", "--dataset.episode=1",
-    )  # fmt: skip
+        replay,
+        monkeypatch,
+        *flags,
+        "--robot.first_start=1",
+        "--dataset.repo_id=local/synthetic",
+        f"--dataset.root={small_dataset.root}",
+        "--dataset.episode=1",
+    )
     table = read_episodes(small_dataset)
     start, length = int(table.start[1]), int(table.length[1])
     actions = torch.from_numpy(table.action[start : start + length])
     imagined = DrivenEnv(
         world_model_path=str(trained_models["action_world_model"]),
         dataset=StartFrames(root=str(small_dataset.root)),
-        episode_length=100, done_frames=100, device="cpu",
-    ).create_tensor_env(1)  # fmt: skip
+        episode_length=100,
+        done_frames=100,
+        device="cpu",
+    ).create_tensor_env(1)
     imagined.reset(seed=[1])
     for action in actions:
         observation, *_ = imagined.step(action[None])
@@ -185,11 +208,19 @@ def test_lerobot_rollout_runs_a_policy_in_it(flags, tmp_path, monkeypatch):
     """It passes on names that end in .pos alone."""
     policy = save_untrained_policy(tmp_path / "policy", actions=7)
     run(
-        rollout, monkeypatch, *flags, "--robot.suffix=.pos", "--robot.episode_time_s=0.5",
-        "--strategy.type=episodic", "--strategy.reset_to_initial_position=false",
-        "--return_to_initial_position=false", f"--policy.path={policy}", f"--fps={FPS}",
-        *recording(tmp_path / "rollout_driven", 0.5, 2), "--dataset.repo_id=local/rollout_driven",
-    )  # fmt: skip
+        rollout,
+        monkeypatch,
+        *flags,
+        "--robot.suffix=.pos",
+        "--robot.episode_time_s=0.5",
+        "--strategy.type=episodic",
+        "--strategy.reset_to_initial_position=false",
+        "--return_to_initial_position=false",
+        f"--policy.path={policy}",
+        f"--fps={FPS}",
+        *recording(tmp_path / "rollout_driven", 0.5, 2),
+        "--dataset.repo_id=local/rollout_driven",
+    )
     dataset = LeRobotDataset("local/rollout_driven", root=tmp_path / "rollout_driven")
     assert dataset.num_episodes == 2
     assert dataset.features["action"]["names"] == [f"{name}.pos" for name in ACTION_NAMES]

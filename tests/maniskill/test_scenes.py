@@ -18,10 +18,14 @@ def test_the_index_is_the_place_in_the_table() -> None:
 
 def test_indices_that_datasets_hold_keep_their_meaning() -> None:
     assert [(s.object, s.container, s.table) for s in SCENES[:7]] == [
-        ("sponge", "plate", "wood"), ("tomato_can", "bowl", "slate"), ("blue_box", "plate", "wood"),
-        ("lime", "bowl", "slate"), ("tomato_can", "plate", "wood"), ("sponge", "plate", "slate"),
+        ("sponge", "plate", "wood"),
+        ("tomato_can", "bowl", "slate"),
+        ("blue_box", "plate", "wood"),
+        ("lime", "bowl", "slate"),
+        ("tomato_can", "plate", "wood"),
+        ("sponge", "plate", "slate"),
         ("sponge", "bowl", "wood"),
-    ]  # fmt: skip
+    ]
 
 
 def test_what_is_held_out_never_occurs_in_training() -> None:

@@ -145,10 +145,15 @@ def test_shaders_without_the_table_draw_the_same_pictures(
         assert np.array_equal(image, expected.images[camera])
 
 
-@pytest.mark.parametrize("files", [
-    {}, {"minimal/a.frag": b"void main() {}"}, {"minimal/a.frag": b"\xff"},
-    {"minimal/a.frag": b"int samplerBRDFLUT;"},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "files",
+    [
+        {},
+        {"minimal/a.frag": b"void main() {}"},
+        {"minimal/a.frag": b"\xff"},
+        {"minimal/a.frag": b"int samplerBRDFLUT;"},
+    ],
+)
 def test_shaders_of_another_sapien_are_taken_as_they_are(files: dict[str, bytes], tmp_path: Path) -> None:
     for name, content in {"common/b.glsl": b"", **files}.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)

@@ -26,10 +26,18 @@ def moved(situation: Situation, by: tuple[float, ...], tcp: tuple[float, ...] = 
     return replace(situation, object_now=now, tcp=now + np.array(tcp))
 
 
-@pytest.mark.parametrize(("dx", "dy", "dz", "success"), [
-    (0.101, 0.0, 0.0, True), (0.099, 0.0, 0.0, False), (0.12, 0.049, 0.0, True), (0.12, -0.051, 0.0, False),
-    (-0.12, 0.0, 0.0, False), (0.12, 0.0, -0.2, False), (0.12, 0.0, 0.1, False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("dx", "dy", "dz", "success"),
+    [
+        (0.101, 0.0, 0.0, True),
+        (0.099, 0.0, 0.0, False),
+        (0.12, 0.049, 0.0, True),
+        (0.12, -0.051, 0.0, False),
+        (-0.12, 0.0, 0.0, False),
+        (0.12, 0.0, -0.2, False),
+        (0.12, 0.0, 0.1, False),
+    ],
+)
 @pytest.mark.parametrize(("task", "sign"), [(Push(), 1), (Pull(), -1)])
 def test_a_slide_is_ten_centimetres_along_and_at_most_five_sideways(
     task: Task, sign: int, dx: float, dy: float, dz: float, success: bool
@@ -37,9 +45,14 @@ def test_a_slide_is_ten_centimetres_along_and_at_most_five_sideways(
     assert task.success(moved(at_start(task), (sign * dx, dy, dz))) is success
 
 
-@pytest.mark.parametrize(("change", "success"), [
-    ({}, True), ({"gripper_opening": 0.3}, False), ({"object_speed": 0.2}, False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "success"),
+    [
+        ({}, True),
+        ({"gripper_opening": 0.3}, False),
+        ({"object_speed": 0.2}, False),
+    ],
+)
 def test_placed_is_inside_let_go_and_at_rest(change: dict[str, float], success: bool) -> None:
     before = at_start(PickPlace())
     inside = np.array([*before.start.container_xy, HEIGHT + 0.008])
@@ -54,9 +67,14 @@ def test_beside_or_above_the_container_is_not_in_it(off: tuple[float, ...]) -> N
     assert not PickPlace().success(replace(before, object_now=place, gripper_opening=1.0))
 
 
-@pytest.mark.parametrize(("off", "speed", "success"), [
-    (0.029, 0.0, True), (0.031, 0.0, False), (0.0, 0.1, False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("off", "speed", "success"),
+    [
+        (0.029, 0.0, True),
+        (0.031, 0.0, False),
+        (0.0, 0.1, False),
+    ],
+)
 def test_at_its_aim_is_within_three_centimetres_and_at_rest(off: float, speed: float, success: bool) -> None:
     before = at_start(MoveToAim())
     assert before.start.carpet_xy is not None

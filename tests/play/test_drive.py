@@ -344,9 +344,10 @@ def test_an_error_midway_loses_nothing(drive, act, at, monkeypatch):
     monkeypatch.setattr(drive.env.model, "decode", failing)
     with pytest.raises(RuntimeError, match="out of memory"):
         {
-            "rewind": lambda: drive.rewind(5), "replay": lambda: list(drive.replay()),
+            "rewind": lambda: drive.rewind(5),
+            "replay": lambda: list(drive.replay()),
             "step": lambda: drive.step(actions[5], "you"),
-        }[act]()  # fmt: skip
+        }[act]()
     assert drive.views[1:] == views
     following = drive.step(actions[5], "you")
     drive.rewind(0)

@@ -165,7 +165,7 @@ def ask(page: Page, message: dict[str, Any]) -> Any:
         import("/static/local.js").then(({ ask }) => ask(message)).then(done, (error) => done(error.message));
         """,
         message,
-    )  # fmt: skip
+    )
 
 
 def test_a_page_reads_the_instruction_that_it_is_given(make_synthetic_dataset, tmp_path, chromium):
@@ -324,8 +324,9 @@ def test_what_has_no_meaning_without_a_server_is_not_shown(page):
     for hidden in ("save", "save-success", "save-failure", "episode-frame", "difference-field"):
         assert not page[hidden].is_displayed()
     assert [each.text for each in page.driver.find_elements(By.CSS_SELECTOR, "#drivers button")] == [
-        "you", "recorded",
-    ]  # fmt: skip
+        "you",
+        "recorded",
+    ]
     page.press("s")
     assert page["status"].text == "ready"
 

@@ -154,12 +154,21 @@ def test_labels_are_kept_while_they_are_made(address, rule, unlabelled):
 def test_ctrl_c_keeps_the_labels_and_says_so(unlabelled, rule, tmp_path):
     page_of(rule, unlabelled).label(2, 4)
     command = subprocess.Popen(
-        [sys.executable, "-m", "lerobot_wmrl.scripts.label", f"--dataset.root={unlabelled.root}",
-         "--success.type=by_hand", f"--success.file={rule.file}", "--success.port=0",
-         f"--output_dir={tmp_path / 'labelled'}"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        [
+            sys.executable,
+            "-m",
+            "lerobot_wmrl.scripts.label",
+            f"--dataset.root={unlabelled.root}",
+            "--success.type=by_hand",
+            f"--success.file={rule.file}",
+            "--success.port=0",
+            f"--output_dir={tmp_path / 'labelled'}",
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background job ignores it
-    )  # fmt: skip
+    )
     assert command.stdout is not None
     assert next(line for line in command.stdout if line.startswith("open "))
     command.send_signal(signal.SIGINT)

@@ -27,10 +27,18 @@ def trained(small_dataset, trained_models, tmp_path_factory) -> Callable[..., Pa
         folder = tmp_path_factory.mktemp("rewards") / kind
         root = Path(small_dataset.root)
         given = [
-            f"--reward_model.type={kind}", "--reward_model.device=cpu", "--reward_model.hidden=32",
-            "--dataset.repo_id=local/synthetic", f"--dataset.root={root}", f"--output_dir={folder}",
-            "--batch_size=8", "--num_workers=0", f"--steps={steps}", f"--save_freq={steps}", *flags,
-        ]  # fmt: skip
+            f"--reward_model.type={kind}",
+            "--reward_model.device=cpu",
+            "--reward_model.hidden=32",
+            "--dataset.repo_id=local/synthetic",
+            f"--dataset.root={root}",
+            f"--output_dir={folder}",
+            "--batch_size=8",
+            "--num_workers=0",
+            f"--steps={steps}",
+            f"--save_freq={steps}",
+            *flags,
+        ]
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(sys, "argv", ["lerobot-train", *given])
             lerobot_train.main()
@@ -55,8 +63,10 @@ def environment(trained_models, small_dataset, kind: str, path: Path | None) -> 
     return WorldModelEnv(
         world_model_path=str(trained_models["action_world_model"]),
         dataset=StartFrames(root=str(Path(small_dataset.root))),
-        reward=config(device="cpu", pretrained_path=path and str(path)), episode_length=3, device="cpu",
-    )  # fmt: skip
+        reward=config(device="cpu", pretrained_path=path and str(path)),
+        episode_length=3,
+        device="cpu",
+    )
 
 
 def test_the_proxy_learns_what_frames_were_worth(proxy, small_dataset):

@@ -32,9 +32,12 @@ def classifier(tmp_path_factory) -> Path:
     )
     backbone.save_pretrained(folder / "backbone")
     config = RewardClassifierConfig(
-        model_name=str(folder / "backbone"), num_cameras=1, num_classes=3, device="cpu",
+        model_name=str(folder / "backbone"),
+        num_cameras=1,
+        num_classes=3,
+        device="cpu",
         input_features={IMAGE: PolicyFeature(FeatureType.VISUAL, (3, 32, 32))},
-    )  # fmt: skip
+    )
     Classifier(config).save_pretrained(folder / "trained")
     statistics = {IMAGE: {"mean": torch.full((3, 1, 1), MEAN), "std": torch.full((3, 1, 1), STD)}}
     make_classifier_processor(config, statistics)[0].save_pretrained(folder / "trained")
@@ -46,9 +49,10 @@ def config(classifier, trained_models, small_dataset) -> WorldModelEnv:
     return WorldModelEnv(
         world_model_path=str(trained_models["action_world_model"]),
         dataset=StartFrames(root=str(Path(small_dataset.root))),
-        reward=RewardClassifierConfig(device="cpu", pretrained_path=str(classifier)), episode_length=3,
+        reward=RewardClassifierConfig(device="cpu", pretrained_path=str(classifier)),
+        episode_length=3,
         device="cpu",
-    )  # fmt: skip
+    )
 
 
 def test_the_environment_pays_what_lerobots_classifier_says_of_prepared_frames(config, classifier):

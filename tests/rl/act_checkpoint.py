@@ -21,14 +21,21 @@ def small_act(state: int = 4, actions: int = 3, images: bool = True) -> ACTPolic
     picture = PolicyFeature(type=FeatureType.VISUAL, shape=(3, 32, 32))
     scene = PolicyFeature(type=FeatureType.ENV, shape=(state,))
     config = ACTConfig(
-        device="cpu", pretrained_backbone_weights=None, dim_model=16, n_heads=2, dim_feedforward=32,
-        n_encoder_layers=1, n_vae_encoder_layers=1, chunk_size=CHUNK, n_action_steps=ACTED,
+        device="cpu",
+        pretrained_backbone_weights=None,
+        dim_model=16,
+        n_heads=2,
+        dim_feedforward=32,
+        n_encoder_layers=1,
+        n_vae_encoder_layers=1,
+        chunk_size=CHUNK,
+        n_action_steps=ACTED,
         input_features={
             **({IMAGE: picture} if images else {SCENE: scene}),
             STATE: PolicyFeature(type=FeatureType.STATE, shape=(state,)),
         },
         output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(actions,))},
-    )  # fmt: skip
+    )
     return ACTPolicy(config).eval()
 
 

@@ -21,9 +21,13 @@ def point_policy(image_size: int = 0, hidden_size: int = 32, initial_std: float 
         image = PolicyFeature(type=FeatureType.VISUAL, shape=(3, image_size, image_size))
         inputs = {"observation.images.third_view": image}
     config = CnnConfig(
-        device="cpu", input_features=inputs, hidden_size=hidden_size, width=8, initial_std=initial_std,
+        device="cpu",
+        input_features=inputs,
+        hidden_size=hidden_size,
+        width=8,
+        initial_std=initial_std,
         output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(3,))},
-    )  # fmt: skip
+    )
     return CnnPolicy(config).eval()
 
 

@@ -17,9 +17,12 @@ def update(algorithm: PolicyGradient, buffer: RolloutBuffer, pipeline: Pipeline)
 
 
 def assert_it_learns(
-    algorithm: PolicyGradient, env: gym.vector.VectorEnv, buffer: RolloutBuffer, pipeline: Pipeline,
+    algorithm: PolicyGradient,
+    env: gym.vector.VectorEnv,
+    buffer: RolloutBuffer,
+    pipeline: Pipeline,
     iterations: int,
-) -> None:  # fmt: skip
+) -> None:
     """Its policy fails at first and mostly succeeds in the end."""
     rates = []
     for iteration in range(iterations):

@@ -48,6 +48,8 @@ def publish_tokenizer(hub: Hub, folder: Path) -> None:
 
 def small_pi0(**features: Any) -> PI0Policy:
     """Return an untrained policy, where `shrink_pi0` has made them small."""
-    return PI0Policy(PI0Config(
-        image_resolution=(SIDE, SIDE), chunk_size=8, n_action_steps=4, num_inference_steps=2, **features
-    ))  # fmt: skip
+    return PI0Policy(
+        PI0Config(
+            image_resolution=(SIDE, SIDE), chunk_size=8, n_action_steps=4, num_inference_steps=2, **features
+        )
+    )

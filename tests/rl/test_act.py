@@ -108,8 +108,9 @@ def test_act_is_saved_as_act_and_what_was_added_with_the_algorithm(
     assert not torch.equal(changed, small_act(images=False).predict_action_chunk(OBSERVATION))
     added = load_file(last / "algorithm" / "model.safetensors")
     assert {name for name in added if name.startswith("adapter.")} == {
-        "adapter.log_std", *(f"adapter.critic.{i}.{kind}" for i in (0, 2) for kind in ("weight", "bias"))
-    }  # fmt: skip
+        "adapter.log_std",
+        *(f"adapter.critic.{i}.{kind}" for i in (0, 2) for kind in ("weight", "bias")),
+    }
     assert not torch.equal(added["adapter.log_std"].exp(), torch.full((3,), INITIAL_STD))
 
 
@@ -137,12 +138,20 @@ def test_the_command_improves_act_in_a_world_model_and_lerobot_evaluates_it(
         "text_world_model_path": str(trained_models["text_world_model"]),
     }
     flags = [
-        f"--policy.path={policy}", "--policy.n_action_steps=2", "--env.type=world_model",
-        *(f"--env.{name}={path}" for name, path in models.items()), "--env.episode_length=4",
-        f"--env.dataset.root={small_dataset.root}", "--num_envs=2", "--iterations=2",
-        "--algorithm.type=ppo", "--algorithm.policy_lr=1e-6", "--algorithm.value_iterations=1",
-        "--gate.action=off", f"--output_dir={tmp_path / 'rl'}",
-    ]  # fmt: skip
+        f"--policy.path={policy}",
+        "--policy.n_action_steps=2",
+        "--env.type=world_model",
+        *(f"--env.{name}={path}" for name, path in models.items()),
+        "--env.episode_length=4",
+        f"--env.dataset.root={small_dataset.root}",
+        "--num_envs=2",
+        "--iterations=2",
+        "--algorithm.type=ppo",
+        "--algorithm.policy_lr=1e-6",
+        "--algorithm.value_iterations=1",
+        "--gate.action=off",
+        f"--output_dir={tmp_path / 'rl'}",
+    ]
     monkeypatch.setattr(sys, "argv", ["lerobot-wmrl-train", *flags])
     main()
     lines = read_metrics(tmp_path / "rl")

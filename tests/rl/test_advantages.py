@@ -16,9 +16,12 @@ def random_rollout(seed: int) -> dict[str, Tensor]:
     numbers = torch.randn(3, STEPS, ENVS, generator=generator, dtype=torch.float64)
     ends = torch.rand(STEPS, ENVS, generator=generator)
     return {
-        "reward": numbers[0], "value": numbers[1], "next_value": numbers[2],
-        "terminated": ends < 0.1, "truncated": (ends >= 0.1) & (ends < 0.2),
-    }  # fmt: skip
+        "reward": numbers[0],
+        "value": numbers[1],
+        "next_value": numbers[2],
+        "terminated": ends < 0.1,
+        "truncated": (ends >= 0.1) & (ends < 0.2),
+    }
 
 
 def advantage_by_sums(rollout: dict[str, np.ndarray], start: int, env: int) -> float:

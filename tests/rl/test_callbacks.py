@@ -86,9 +86,15 @@ def run(
     env = PointEnv(8, horizon=6)
     algorithm = PPO(policy, PPOConfig(value_iterations=1, minibatch_size=32, policy_lr=1e-3))
     train(
-        env, algorithm, pipeline, RolloutBuffer(6, 8, "cpu"), Schedule(ITERATIONS, 100, 0), output_dir,
-        policy.save_pretrained, callbacks(env),
-    )  # fmt: skip
+        env,
+        algorithm,
+        pipeline,
+        RolloutBuffer(6, 8, "cpu"),
+        Schedule(ITERATIONS, 100, 0),
+        output_dir,
+        policy.save_pretrained,
+        callbacks(env),
+    )
     return algorithm.policy
 
 

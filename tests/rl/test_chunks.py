@@ -93,9 +93,15 @@ def test_a_decision_is_worth_its_discounted_steps(
     """The definition: δ = Σ_{i<n} γ^i r_i + γ^n V' − V, A = δ + λ γ^n A', decision after decision."""
     _, _, buffer = rollout
     found = generalised_advantages(
-        buffer.reward.double(), buffer.value.double(), buffer.next_value.double(), buffer.terminated,
-        buffer.truncated, 0.9, 0.8, buffer.decided,
-    )  # fmt: skip
+        buffer.reward.double(),
+        buffer.value.double(),
+        buffer.next_value.double(),
+        buffer.terminated,
+        buffer.truncated,
+        0.9,
+        0.8,
+        buffer.decided,
+    )
     for env in range(ENVS):
         following, advantage = STEPS, 0.0
         for step in reversed(buffer.decided[:, env].nonzero()[:, 0].tolist()):

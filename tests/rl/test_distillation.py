@@ -60,23 +60,39 @@ from tests.rl.small_pi0 import publish_tokenizer, shrink_pi0, small_pi0
 from tests.rl.small_smolvla import save_small_smolvlm, small_smolvla
 
 FAST = [
-    "--algorithm.type=distillation", "--algorithm.planner.horizon=6", "--algorithm.planner.samples=4",
-    "--algorithm.planner.elites=2", "--algorithm.planner.iterations=1", "--algorithm.planner.knots=3",
-    "--algorithm.planner.execute=2", "--algorithm.longest_lead=2", "--algorithm.updates=2",
-    "--algorithm.last_updates=3", "--algorithm.batch_size=4", "--algorithm.recorded=false",
-    "--num_envs=3", "--iterations=3", "--save_freq=1",
-]  # fmt: skip
+    "--algorithm.type=distillation",
+    "--algorithm.planner.horizon=6",
+    "--algorithm.planner.samples=4",
+    "--algorithm.planner.elites=2",
+    "--algorithm.planner.iterations=1",
+    "--algorithm.planner.knots=3",
+    "--algorithm.planner.execute=2",
+    "--algorithm.longest_lead=2",
+    "--algorithm.updates=2",
+    "--algorithm.last_updates=3",
+    "--algorithm.batch_size=4",
+    "--algorithm.recorded=false",
+    "--num_envs=3",
+    "--iterations=3",
+    "--save_freq=1",
+]
 
 
 @pytest.fixture
 def imagined(trained_models: dict[str, Path], small_dataset: LeRobotDataset) -> list[str]:
     """Flags of a world model in which every episode succeeds after four frames."""
     return [
-        "--env.type=world_model", f"--env.world_model_path={trained_models['action_world_model']}",
-        "--env.reward.type=general", "--env.reward.alpha=1", f"--env.dataset.root={small_dataset.root}",
-        "--env.episode_length=6", "--env.done_frames=4", "--env.done_threshold=1e-6", "--env.device=cpu",
+        "--env.type=world_model",
+        f"--env.world_model_path={trained_models['action_world_model']}",
+        "--env.reward.type=general",
+        "--env.reward.alpha=1",
+        f"--env.dataset.root={small_dataset.root}",
+        "--env.episode_length=6",
+        "--env.done_frames=4",
+        "--env.done_threshold=1e-6",
+        "--env.device=cpu",
         "--gate.action=off",
-    ]  # fmt: skip
+    ]
 
 
 def train(monkeypatch: pytest.MonkeyPatch, *flags: str) -> None:
@@ -140,9 +156,13 @@ def test_imagined_frames_are_kept_as_small_as_they_are_imagined(
         assert load_file(file)[IMAGE].shape[1:] == (3, 32, 32)
     seen = []
     evaluate = CnnPolicy.evaluate
-    monkeypatch.setattr(CnnPolicy, "evaluate", lambda self, observation, raw: (
-        seen.append(observation[IMAGE].shape[1:]) or evaluate(self, observation, raw)
-    ))  # fmt: skip
+    monkeypatch.setattr(
+        CnnPolicy,
+        "evaluate",
+        lambda self, observation, raw: (
+            seen.append(observation[IMAGE].shape[1:]) or evaluate(self, observation, raw)
+        ),
+    )
     train(monkeypatch, *flags, "--num_envs=2", "--iterations=1", f"--output_dir={tmp_path / 'ppo'}")
     assert {*seen} == {(3, 48, 80)}
 
@@ -295,40 +315,65 @@ def test_policies_of_chunks_learn_chunks(
 
 
 FEATURES: dict[str, Any] = {
-    "device": "cpu", "pretrained_backbone_weights": None, "crop_shape": None, "use_group_norm": True,
+    "device": "cpu",
+    "pretrained_backbone_weights": None,
+    "crop_shape": None,
+    "use_group_norm": True,
     "spatial_softmax_num_keypoints": 4,
     "input_features": {
-        IMAGE: PolicyFeature(FeatureType.VISUAL, (3, 32, 32)), STATE: PolicyFeature(FeatureType.STATE, (8,)),
+        IMAGE: PolicyFeature(FeatureType.VISUAL, (3, 32, 32)),
+        STATE: PolicyFeature(FeatureType.STATE, (8,)),
     },
     "output_features": {ACTION: PolicyFeature(FeatureType.ACTION, (7,))},
-}  # fmt: skip
+}
 
 
 def small_vqbet(observations: int) -> VQBeTPolicy:
-    return VQBeTPolicy(VQBeTConfig(
-        **FEATURES, n_obs_steps=observations, n_vqvae_training_steps=1, vqvae_embedding_dim=8,
-        vqvae_enc_hidden_dim=8, gpt_input_dim=16, gpt_output_dim=16, gpt_hidden_dim=16, gpt_n_layer=1,
-        gpt_n_head=2,
-    ))  # fmt: skip
+    return VQBeTPolicy(
+        VQBeTConfig(
+            **FEATURES,
+            n_obs_steps=observations,
+            n_vqvae_training_steps=1,
+            vqvae_embedding_dim=8,
+            vqvae_enc_hidden_dim=8,
+            gpt_input_dim=16,
+            gpt_output_dim=16,
+            gpt_hidden_dim=16,
+            gpt_n_layer=1,
+            gpt_n_head=2,
+        )
+    )
 
 
 def small_diffusion(observations: int) -> DiffusionPolicy:
-    return DiffusionPolicy(DiffusionConfig(
-        **FEATURES, n_obs_steps=observations, horizon=8, n_action_steps=4, down_dims=(16, 32), n_groups=4,
-        diffusion_step_embed_dim=16, num_train_timesteps=4,
-    ))  # fmt: skip
+    return DiffusionPolicy(
+        DiffusionConfig(
+            **FEATURES,
+            n_obs_steps=observations,
+            horizon=8,
+            n_action_steps=4,
+            down_dims=(16, 32),
+            n_groups=4,
+            diffusion_step_embed_dim=16,
+            num_train_timesteps=4,
+        )
+    )
 
 
 @pytest.mark.parametrize(("make", "observations"), [(small_vqbet, 1), (small_vqbet, 3), (small_diffusion, 2)])
 def test_policies_of_several_observations_learn_from_as_many(
-    make: Callable[[int], Any], observations: int, imagined: list[str], tmp_path: Path,
+    make: Callable[[int], Any],
+    observations: int,
+    imagined: list[str],
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     """VQ-BeT learns from observations (B, n, …), also where n is 1."""
     made, policy, output_dir = make(observations), tmp_path / "policy", tmp_path / "rl"
-    stats = {key: {"min": torch.full(size, -1.0), "max": torch.ones(size)} for key, size in (
-        (STATE, (8,)), (ACTION, (7,))
-    )}  # fmt: skip
+    stats = {
+        key: {"min": torch.full(size, -1.0), "max": torch.ones(size)}
+        for key, size in ((STATE, (8,)), (ACTION, (7,)))
+    }
     stats[IMAGE] = {"mean": torch.zeros(3, 1, 1), "std": torch.ones(3, 1, 1)}
     distil(made, stats, policy, [*imagined, f"--output_dir={output_dir}"], monkeypatch)
     assert read_metrics(output_dir)[-1]["labels"] >= 3 * 4
@@ -383,9 +428,9 @@ def test_a_vla_with_action_chunks_learns_from_the_planner(
         publish_tokenizer(hub, tmp_path / "tokenizer")
         made = small_pi0(**features)
     policy, output_dir = tmp_path / "policy", tmp_path / "rl"
-    stats = {key: {"mean": torch.zeros(size), "std": torch.ones(size)} for key, size in (
-        (STATE, 8), (ACTION, 7)
-    )}  # fmt: skip
+    stats = {
+        key: {"mean": torch.zeros(size), "std": torch.ones(size)} for key, size in ((STATE, 8), (ACTION, 7))
+    }
     distil(made, stats, policy, [*imagined, f"--output_dir={output_dir}"], monkeypatch)
     assert read_metrics(output_dir)[-1]["labels"] >= 3 * 4
     before, after = load_file(policy / "model.safetensors"), weights(output_dir)
@@ -438,9 +483,13 @@ def test_without_a_success_there_is_nothing_to_learn_from(
     ],
 )
 def test_what_cannot_be_is_refused_by_its_flag(
-    flags: list[str], named: str, imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    flags: list[str],
+    named: str,
+    imagined: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     policy = save_untrained_policy(tmp_path / "policy", actions=7)
     given = imagined if not flags[0].startswith("--env.type") else []
     with pytest.raises(SystemExit):
@@ -473,8 +522,13 @@ def test_a_chunk_ends_with_its_run_and_repeats_the_last_action():
     found = action_windows(actions, labelled, [0, 1])
     assert found["action"][..., 0].tolist() == [[0, 1], [1, 2], [11, 12], [2, 2], [12, 13], [13, 13]]
     assert found["action_is_pad"].tolist() == [
-        [False, False], [False, False], [False, False], [False, True], [False, False], [False, True],
-    ]  # fmt: skip
+        [False, False],
+        [False, False],
+        [False, False],
+        [False, True],
+        [False, False],
+        [False, True],
+    ]
     assert action_windows(actions, labelled, None)["action"][:, 0].tolist() == [0, 1, 11, 2, 12, 13]
 
 

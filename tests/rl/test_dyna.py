@@ -29,9 +29,12 @@ WEIGHTS = "checkpoints/last/pretrained_model/model.safetensors"
 def env(small_dataset: LeRobotDataset, trained_models: dict[str, Path]) -> Any:
     config = WorldModelEnv(
         world_model_path=str(trained_models["action_world_model"]),
-        dataset=StartFrames(root=str(small_dataset.root)), reward=GeneralConfig(alpha=1.0),
-        done_frames=2, episode_length=4, device="cpu",
-    )  # fmt: skip
+        dataset=StartFrames(root=str(small_dataset.root)),
+        reward=GeneralConfig(alpha=1.0),
+        done_frames=2,
+        episode_length=4,
+        device="cpu",
+    )
     return config.create_tensor_env(2)
 
 
@@ -108,13 +111,17 @@ def test_rounds_build_on_one_another(
         record = rounds.run(iteration, tmp_path / "checkpoints" / f"{iteration:06d}", folder)
         assert record["episodes"] == 2 * small_dataset.num_episodes
     assert recorder.asked == [
-        ("000003", 2, 900_000, 0.0), ("000003", 3, 900_002, 0.4),
-        ("000006", 2, 900_005, 0.0), ("000006", 3, 900_007, 0.4),
-    ]  # fmt: skip
+        ("000003", 2, 900_000, 0.0),
+        ("000003", 3, 900_002, 0.4),
+        ("000006", 2, 900_005, 0.0),
+        ("000006", 3, 900_007, 0.4),
+    ]
     starts = {
         replace(rounds, seed=seed).start(number, half)
-        for seed in (0, 1, 2, 100_000, 200_000) for number in (0, 1) for half in (0, 1)
-    }  # fmt: skip
+        for seed in (0, 1, 2, 100_000, 200_000)
+        for number in (0, 1)
+        for half in (0, 1)
+    }
     assert len(starts) == 5 * 4
     assert np.diff(sorted(starts)).min() >= 2, "runs with other seeds record other starts"
     last = folder / "action_world_model" / "checkpoints" / "last" / "pretrained_model"

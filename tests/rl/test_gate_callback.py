@@ -40,9 +40,13 @@ BELIEVES_ALL, BELIEVES_NONE = 0.0001, 0.9999
 def env(small_dataset: LeRobotDataset, trained_models: dict[str, Path]) -> Any:
     config = WorldModelEnv(
         world_model_path=str(trained_models["action_world_model"]),
-        dataset=StartFrames(root=str(small_dataset.root)), reward=GeneralConfig(alpha=1.0),
-        done_threshold=BELIEVES_ALL, done_frames=2, episode_length=20, device="cpu",
-    )  # fmt: skip
+        dataset=StartFrames(root=str(small_dataset.root)),
+        reward=GeneralConfig(alpha=1.0),
+        done_threshold=BELIEVES_ALL,
+        done_frames=2,
+        episode_length=20,
+        device="cpu",
+    )
     return config.create_tensor_env(2)
 
 
@@ -118,9 +122,14 @@ def test_at_the_limit_training_goes_on(
 
 
 def test_rollouts_that_a_dyna_round_has_learnt_from_are_warned_about(
-    make_gate: Any, make_synthetic_dataset: Any, env: Any, tmp_path: Path,
-    trained_models: dict[str, Path], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    make_gate: Any,
+    make_synthetic_dataset: Any,
+    env: Any,
+    tmp_path: Path,
+    trained_models: dict[str, Path],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     root = str(make_synthetic_dataset(tmp_path / "recorded", episodes=3, length=5).root)
     newer = tmp_path / "newer"
     shutil.copytree(model_folder(trained_models["action_world_model"]), newer)
@@ -156,9 +165,12 @@ def test_it_asks_in_every_new_world_model_and_again_where_it_can_roll_out(make_g
 def test_the_recorder_gets_what_is_not_as_by_default() -> None:
     env = WmrlManiSkillEnv(task="pull", scenes=[0, 2], image_size=64, cameras=["wrist"])
     assert env_flags(env) == {
-        "env.type": "wmrl_maniskill", "env.task": "pull", "env.scenes": [0, 2], "env.image_size": 64,
+        "env.type": "wmrl_maniskill",
+        "env.task": "pull",
+        "env.scenes": [0, 2],
+        "env.image_size": 64,
         "env.cameras": ["wrist"],
-    }  # fmt: skip
+    }
 
 
 def test_settings_that_are_mappings_are_given_whole() -> None:
@@ -183,9 +195,14 @@ def test_a_recording_in_a_batched_maniskill_has_a_simulation_in_each_worker(
 
 @pytest.mark.parametrize(("labelled", "fresh", "failed"), [(0, 0, False), (9, 0, True), (0, 9, True)])
 def test_either_source_of_rollouts_fails_the_world_model(
-    labelled: int, fresh: int, failed: bool, env: Any, small_dataset: LeRobotDataset, tmp_path: Path,
+    labelled: int,
+    fresh: int,
+    failed: bool,
+    env: Any,
+    small_dataset: LeRobotDataset,
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     class Recorder:
         seeds: ClassVar[list[int]] = []
 
@@ -197,9 +214,13 @@ def test_either_source_of_rollouts_fails_the_world_model(
 
     def verdict(*_: Any) -> Gate:
         return Gate(
-            criterion=SuccessCriterion(0.5, 1), false_positives=Proportion(next(found), 10),
-            recall=Proportion(1, 1), cut_short=0, repeats_last=False, auc=1.0,
-        )  # fmt: skip
+            criterion=SuccessCriterion(0.5, 1),
+            false_positives=Proportion(next(found), 10),
+            recall=Proportion(1, 1),
+            cut_short=0,
+            repeats_last=False,
+            auc=1.0,
+        )
 
     monkeypatch.setattr("lerobot_wmrl.rl.gate_callback.gate_at", verdict)
     config = GateConfig(dataset=DatasetSource(str(small_dataset.root)), n_episodes=5, limit=0.5)

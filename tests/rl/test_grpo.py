@@ -163,10 +163,14 @@ def test_grpo_learns_to_reach(make_policy: MakePolicy, pipeline: Pipeline) -> No
     assert_it_learns(algorithm, env, buffer, pipeline, 30)
 
 
-@pytest.mark.parametrize(("settings", "message"), [
-    ({"group_size": 1}, r"group_size=1"), ({"clip_high": 0.0}, r"clip_high=0\.0"),
-    ({"least_group_std": 0.0}, r"least_group_std=0\.0"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"group_size": 1}, r"group_size=1"),
+        ({"clip_high": 0.0}, r"clip_high=0\.0"),
+        ({"least_group_std": 0.0}, r"least_group_std=0\.0"),
+    ],
+)
 def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         GRPOConfig(**settings)

@@ -102,13 +102,17 @@ def test_a_checkpoint_keeps_the_scale_of_the_returns_apart_from_the_policy(
         loaded.load_state_dict({"std": torch.zeros(())})
 
 
-@pytest.mark.parametrize(("settings", "message"), [
-    ({"clip": 0.0}, r"clip=0\.0"), ({"micro_batch_size": 0}, r"micro_batch_size=0"),
-    ({"ratio": "sentence"}, "ratio=sentence: choose one of action, token"),
-    ({"initial_std": 0.0}, r"^initial_std=0\.0: must be above 0"),
-    ({"reference_coefficient": -0.1}, r"^reference_coefficient=-0\.1: must be at least 0"),
-    ({"max_reference_kl": 0.0}, r"^max_reference_kl=0\.0: must be above 0"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"clip": 0.0}, r"clip=0\.0"),
+        ({"micro_batch_size": 0}, r"micro_batch_size=0"),
+        ({"ratio": "sentence"}, "ratio=sentence: choose one of action, token"),
+        ({"initial_std": 0.0}, r"^initial_std=0\.0: must be above 0"),
+        ({"reference_coefficient": -0.1}, r"^reference_coefficient=-0\.1: must be at least 0"),
+        ({"max_reference_kl": 0.0}, r"^max_reference_kl=0\.0: must be above 0"),
+    ],
+)
 def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         PPOConfig(**settings)

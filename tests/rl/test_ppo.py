@@ -238,9 +238,15 @@ def test_targets_have_the_discount_of_the_longest_episode_and_gradients_are_clip
     collect(PointEnv(16, horizon=6), policy, pipeline, buffer, seed=0)
     algorithm.add_targets(buffer)
     advantages = generalised_advantages(
-        buffer.reward, buffer.value, buffer.next_value, buffer.terminated, buffer.truncated,
-        default_discount(6), algorithm.config.gae_lambda, buffer.decided,
-    )  # fmt: skip
+        buffer.reward,
+        buffer.value,
+        buffer.next_value,
+        buffer.terminated,
+        buffer.truncated,
+        default_discount(6),
+        algorithm.config.gae_lambda,
+        buffer.decided,
+    )
     torch.testing.assert_close(buffer.columns["target"], advantages + buffer.value)
     torch.testing.assert_close(buffer.columns["advantage"], normalised(advantages, buffer.decided))
     algorithm.add_reference(buffer, pipeline)

@@ -31,9 +31,12 @@ from tests.rl.checkpoints import loaded, save_untrained_policy
 
 STEPS, AIM = 5, 250.0
 ROBOT = Embodiment(
-    fps=10, action_names=["x", "y"], action_low=[0.0, 0.0], action_high=[512.0, 512.0],
+    fps=10,
+    action_names=["x", "y"],
+    action_low=[0.0, 0.0],
+    action_high=[512.0, 512.0],
     state_names=["agent_x", "agent_y"],
-)  # fmt: skip
+)
 
 
 @pytest.fixture(scope="module")

@@ -31,10 +31,16 @@ class Recorder(PointEnv):
     def step(self, action: Tensor) -> Any:
         shown = self._observe()
         result = super().step(action)
-        self.log.append({
-            "shown": shown, "action": action, "reward": result[1], "terminated": result[2],
-            "truncated": result[3], "next": result[4].get("final_obs", result[0]),
-        })  # fmt: skip
+        self.log.append(
+            {
+                "shown": shown,
+                "action": action,
+                "reward": result[1],
+                "terminated": result[2],
+                "truncated": result[3],
+                "next": result[4].get("final_obs", result[0]),
+            }
+        )
         return result
 
 

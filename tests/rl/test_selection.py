@@ -95,16 +95,19 @@ def test_imagined_success_is_compared_within_one_world_model(tmp_path: Path) -> 
         Selection(5, 12, {"real": measure(0), "imagined": measure(0)}, tmp_path, [10]).apply(records)
 
 
-@pytest.mark.parametrize(("latest", "expected"), [
-    (record(0.20, 0.80), True),  # as measured once: imagined 0.55 → 0.80, real 0.53 → 0.20
-    (record(0.20, 0.55), True),
-    (record(0.34, 0.80), False),  # the intervals touch
-    (record(0.20, 0.40), False),  # imagination sees it fail
-    (record(0.53, 0.80), False),
-    (record(0.02, 0.80, n=5), False),  # too few episodes to say
-    (record(None, 0.80), False),
-    (record(0.20, None), False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("latest", "expected"),
+    [
+        (record(0.20, 0.80), True),  # as measured once: imagined 0.55 → 0.80, real 0.53 → 0.20
+        (record(0.20, 0.55), True),
+        (record(0.34, 0.80), False),  # the intervals touch
+        (record(0.20, 0.40), False),  # imagination sees it fail
+        (record(0.53, 0.80), False),
+        (record(0.02, 0.80, n=5), False),  # too few episodes to say
+        (record(None, 0.80), False),
+        (record(0.20, None), False),
+    ],
+)
 def test_imagined_and_real_success_part(latest: Record, expected: bool) -> None:
     assert diverged(record(0.53, 0.55), latest) is expected
 
@@ -123,14 +126,21 @@ class Imagining(PointEnv):
     model = None
 
 
-@pytest.mark.parametrize(("real_env", "config", "env", "places"), [
-    (None, PushtEnv(), PointEnv, ["real"]), (None, PointConfig(), PointEnv, ["real"]),
-    (PushtEnv(), PointConfig(), Imagining, ["real", "imagined"]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("real_env", "config", "env", "places"),
+    [
+        (None, PushtEnv(), PointEnv, ["real"]),
+        (None, PointConfig(), PointEnv, ["real"]),
+        (PushtEnv(), PointConfig(), Imagining, ["real", "imagined"]),
+    ],
+)
 def test_success_is_measured_on_seeds_that_nothing_is_reported_on(
-    real_env: EnvConfig | None, config: EnvConfig, env: type[PointEnv], places: list[str],
+    real_env: EnvConfig | None,
+    config: EnvConfig,
+    env: type[PointEnv],
+    places: list[str],
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     for name in ("evaluate_policy", "evaluate_within"):
         signature = inspect.signature(getattr(make_callbacks, name))
 
@@ -157,15 +167,21 @@ def test_tasks_of_maniskill_are_measured_one_by_one(monkeypatch: pytest.MonkeyPa
 
 
 def test_starts_are_tokenised_once_and_a_refreshed_world_model_is_measured(
-    small_dataset: LeRobotDataset, trained_models: dict[str, Path], tmp_path: Path,
+    small_dataset: LeRobotDataset,
+    trained_models: dict[str, Path],
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     """Nothing ever succeeds in the first one, everything in the other."""
     path, read = trained_models["action_world_model"], []
     config = WorldModelEnv(
-        world_model_path=str(path), dataset=StartFrames(root=str(small_dataset.root)),
-        reward=GeneralConfig(alpha=1.0), done_frames=1, episode_length=2, device="cpu",
-    )  # fmt: skip
+        world_model_path=str(path),
+        dataset=StartFrames(root=str(small_dataset.root)),
+        reward=GeneralConfig(alpha=1.0),
+        done_frames=1,
+        episode_length=2,
+        device="cpu",
+    )
     env: Any = config.create_tensor_env(2)
 
     def read_start_images(*args: Any) -> StartImages:

@@ -37,22 +37,29 @@ def episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root, rng = tmp_path_factory.mktemp("joints") / "episodes", np.random.default_rng(0)
     joints = {"dtype": "float32", "shape": (3,), "names": JOINTS}
     features = {
-        "action": joints, "observation.state": joints,
+        "action": joints,
+        "observation.state": joints,
         OBS_IMAGE: {
-            "dtype": "image", "shape": (HEIGHT, WIDTH, 3), "names": ["height", "width", "channels"],
+            "dtype": "image",
+            "shape": (HEIGHT, WIDTH, 3),
+            "names": ["height", "width", "channels"],
         },
         "next.success": {"dtype": "bool", "shape": (1,), "names": None},
-    }  # fmt: skip
+    }
     dataset = LeRobotDataset.create("local/joints", FPS, features, root=root, use_videos=False)
     for episode in range(6):
         for frame in range(FRAMES):
             share = np.array([frame / (FRAMES - 1), 1 - frame / (FRAMES - 1), episode % 2])
             angles = (LOW + share * np.subtract(HIGH, LOW)).astype(np.float32)
-            dataset.add_frame({
-                "action": angles, "observation.state": angles, "task": "reach",
-                OBS_IMAGE: rng.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8),
-                "next.success": np.array([bool(episode % 2) and frame >= FRAMES - 3]),
-            })  # fmt: skip
+            dataset.add_frame(
+                {
+                    "action": angles,
+                    "observation.state": angles,
+                    "task": "reach",
+                    OBS_IMAGE: rng.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8),
+                    "next.success": np.array([bool(episode % 2) and frame >= FRAMES - 3]),
+                }
+            )
         dataset.save_episode()
     dataset.finalize()
     return root
@@ -69,16 +76,23 @@ def world_model(episodes: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 def imagination(world_model: Path, episodes: Path) -> list[str]:
     return [
-        "--env.type=world_model", f"--env.world_model_path={world_model}", f"--env.dataset.root={episodes}",
-        "--env.episode_length=6", "--env.reward.type=general", "--env.reward.alpha=1", "--gate.action=off",
-    ]  # fmt: skip
+        "--env.type=world_model",
+        f"--env.world_model_path={world_model}",
+        f"--env.dataset.root={episodes}",
+        "--env.episode_length=6",
+        "--env.reward.type=general",
+        "--env.reward.alpha=1",
+        "--gate.action=off",
+    ]
 
 
 def test_the_environment_is_that_robot(world_model: Path, episodes: Path) -> None:
     config = WorldModelEnv(
-        world_model_path=str(world_model), dataset=StartFrames(root=str(episodes)), episode_length=6,
+        world_model_path=str(world_model),
+        dataset=StartFrames(root=str(episodes)),
+        episode_length=6,
         reward=GeneralConfig(alpha=1.0),
-    )  # fmt: skip
+    )
     env = config.create_tensor_env(2)
     assert (config.fps, env.metadata["render_fps"]) == (FPS, FPS)
     np.testing.assert_allclose(env.single_action_space.low, LOW)
@@ -101,9 +115,12 @@ def test_its_policy_is_improved_in_imagination(
 
 
 def test_a_policy_in_other_units_is_refused(
-    world_model: Path, episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    world_model: Path,
+    episodes: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     policy = save_untrained_policy(
         tmp_path / "policy", camera=OBS_IMAGE, size=(HEIGHT, WIDTH), constant=5000.0
     )
@@ -122,14 +139,25 @@ def test_its_imagined_episodes_are_recorded(
 ) -> None:
     """Success is marked in the frames that made it, the last two."""
     env = WorldModelEnv(
-        world_model_path=str(world_model), dataset=StartFrames(root=str(episodes)), episode_length=6,
-        reward=GeneralConfig(alpha=1.0), done_threshold=threshold, done_frames=2,
-    )  # fmt: skip
+        world_model_path=str(world_model),
+        dataset=StartFrames(root=str(episodes)),
+        episode_length=6,
+        reward=GeneralConfig(alpha=1.0),
+        done_threshold=threshold,
+        done_frames=2,
+    )
     policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=(HEIGHT, WIDTH), constant=30.0)
-    record(RecordConfig(
-        output_dir=tmp_path / "imagined", env=env, num_episodes=3, part_episodes=2, exploration=0.1,
-        policy=read_policy_config(str(policy), []), video=False,
-    ))  # fmt: skip
+    record(
+        RecordConfig(
+            output_dir=tmp_path / "imagined",
+            env=env,
+            num_episodes=3,
+            part_episodes=2,
+            exploration=0.1,
+            policy=read_policy_config(str(policy), []),
+            video=False,
+        )
+    )
     table = read_episodes(open_dataset(tmp_path / "imagined"))
     features = table.dataset.features
     assert (table.dataset.fps, features["action"]["names"]) == (FPS, JOINTS)
@@ -142,9 +170,15 @@ def test_its_imagined_episodes_are_recorded(
 
 def test_it_can_be_planned_for(world_model: Path) -> None:
     config = WmMpcConfig(
-        world_model_path=str(world_model), horizon=6, execute=2, samples=4, elites=2, iterations=1, knots=2,
+        world_model_path=str(world_model),
+        horizon=6,
+        execute=2,
+        samples=4,
+        elites=2,
+        iterations=1,
+        knots=2,
         device="cpu",
-    )  # fmt: skip
+    )
     image = torch.rand(2, 3, HEIGHT, WIDTH)
     state = torch.tensor([LOW, HIGH])
     planner = WmMpcPolicy(config)

@@ -23,10 +23,15 @@ from tests.rl.checkpoints import save_untrained_policy
 from tests.scripts.point_config import PointConfig
 
 TOKENIZER = [
-    "--model.type=frame_tokenizer", "--model.device=cpu", "--model.tokenizer.image_size=32",
-    "--model.tokenizer.widths=[8,16]", "--model.tokenizer.levels=[5,4]", "--dataset.root={data}",
-    "--steps=1", "--batch_size=2",
-]  # fmt: skip
+    "--model.type=frame_tokenizer",
+    "--model.device=cpu",
+    "--model.tokenizer.image_size=32",
+    "--model.tokenizer.widths=[8,16]",
+    "--model.tokenizer.levels=[5,4]",
+    "--dataset.root={data}",
+    "--steps=1",
+    "--batch_size=2",
+]
 SHORT = [
     "--algorithm.type=ppo",
     "--num_envs=2",
@@ -36,10 +41,16 @@ SHORT = [
 ]
 STARTS = "--env.dataset.root={data}"
 IMAGINED = [
-    "--policy.path={pushing}", "--env.type=world_model", "--env.world_model_path={action_world_model}",
-    "--env.reward.type=general", "--env.reward.alpha=1", "--env.episode_length=4", "--env.done_frames=1",
-    "--env.device=cpu", *SHORT,
-]  # fmt: skip
+    "--policy.path={pushing}",
+    "--env.type=world_model",
+    "--env.world_model_path={action_world_model}",
+    "--env.reward.type=general",
+    "--env.reward.alpha=1",
+    "--env.episode_length=4",
+    "--env.done_frames=1",
+    "--env.device=cpu",
+    *SHORT,
+]
 SIMULATED = ["--policy.path={pointing}", "--env.type=test_point", *SHORT]
 UNCHECKED = "--gate.action=warn"
 REAL = ["--real_env.type=wmrl_maniskill", "--real_env.image_size=32"]
@@ -77,18 +88,25 @@ def change(root: Path, episode: int, column: str, value: int) -> None:
 
 @pytest.fixture
 def paths(
-    trained_models: dict[str, Path], small_dataset: LeRobotDataset, other: Path, reported: Path,
+    trained_models: dict[str, Path],
+    small_dataset: LeRobotDataset,
+    other: Path,
+    reported: Path,
     tmp_path: Path,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """What flags may name; the budget knows the episodes of `data`, six of its eight demonstrations."""
     ledger = Ledger.create(tmp_path / "budget.json", Limits(demonstrations=8, rollouts=5))
     ledger.charge(read_episodes(small_dataset))
     return {
-        **trained_models, "data": small_dataset.root, "other": other, "reported": reported,
-        "out": tmp_path / "out", "budget": ledger.path,
+        **trained_models,
+        "data": small_dataset.root,
+        "other": other,
+        "reported": reported,
+        "out": tmp_path / "out",
+        "budget": ledger.path,
         "pointing": save_untrained_policy(tmp_path / "pointing"),
         "pushing": save_untrained_policy(tmp_path / "pushing", actions=7),
-    }  # fmt: skip
+    }
 
 
 @pytest.fixture
@@ -104,32 +122,66 @@ def run(paths: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> Any:
     return call
 
 
-@pytest.mark.parametrize(("command", "flags", "message"), [
-    (train_world_model, [*TOKENIZER, "--dataset.root={other}"], "--dataset.root" + UNKNOWN),
-    (train_world_model, [*TOKENIZER, "--dataset.more=[{other}]"], "--dataset.more" + UNKNOWN),
-    (train, [*IMAGINED, UNCHECKED, "--env.dataset.root={other}"], "--env.dataset.root" + UNKNOWN),
-    (train, [*IMAGINED, STARTS, "--gate.dataset.root={other}"], "--gate.dataset.root" + UNKNOWN),
-    (train, [*IMAGINED, STARTS, UNCHECKED, "--selection.dataset.root={other}"],
-     "--selection.dataset.root" + UNKNOWN),
-    (train, [*IMAGINED, STARTS, UNCHECKED, "--dyna.rounds=1", "--dyna.dataset.roots=[{other}]"],
-     "--dyna.dataset.roots" + UNKNOWN),
-    (train, [*IMAGINED, STARTS, UNCHECKED, "--dyna.rounds=1", "--dyna.dataset.roots=[]",
-             "--dyna.learnt.root={other}"], "--dyna.learnt.root" + UNKNOWN),
-    (train, [*IMAGINED, UNCHECKED, "--env.dataset.resets=2"], "--env.dataset.resets=2: under a budget"),
-    (train, [*IMAGINED, UNCHECKED, "--env.dataset.frames=starts.npz"], "starts.npz: under a budget"),
-    (train, [*IMAGINED, STARTS, *REAL, "--selection.freq=1"], "--selection.freq=1: under a budget"),
-    (train_world_model, [*TOKENIZER, "--dataset.more=[{out}]"], "--dataset.more={out}: no LeRobotDataset"),
-    (train, [*IMAGINED, STARTS, "--gate.dataset.root={out}"], "--gate.dataset.root={out}: no LeRobotDataset"),
-    (train, [*IMAGINED, STARTS, UNCHECKED, "--dyna.rounds=1", "--dyna.dataset.roots=[{out}]"],
-     "--dyna.dataset.roots={out}: no LeRobotDataset"),
-    (train, [*SIMULATED, "--selection.freq=1"], "leave out --real_env.type, or --selection.freq"),
-    (train, [*SIMULATED, "--iterations=3"], "6 more rollouts are wanted, 5 of 5 are left"),
-    (train, [*SIMULATED, "--budget={out}/none.json"], "none.json: there is no such file; write it: "),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("command", "flags", "message"),
+    [
+        (train_world_model, [*TOKENIZER, "--dataset.root={other}"], "--dataset.root" + UNKNOWN),
+        (train_world_model, [*TOKENIZER, "--dataset.more=[{other}]"], "--dataset.more" + UNKNOWN),
+        (train, [*IMAGINED, UNCHECKED, "--env.dataset.root={other}"], "--env.dataset.root" + UNKNOWN),
+        (train, [*IMAGINED, STARTS, "--gate.dataset.root={other}"], "--gate.dataset.root" + UNKNOWN),
+        (
+            train,
+            [*IMAGINED, STARTS, UNCHECKED, "--selection.dataset.root={other}"],
+            "--selection.dataset.root" + UNKNOWN,
+        ),
+        (
+            train,
+            [*IMAGINED, STARTS, UNCHECKED, "--dyna.rounds=1", "--dyna.dataset.roots=[{other}]"],
+            "--dyna.dataset.roots" + UNKNOWN,
+        ),
+        (
+            train,
+            [
+                *IMAGINED,
+                STARTS,
+                UNCHECKED,
+                "--dyna.rounds=1",
+                "--dyna.dataset.roots=[]",
+                "--dyna.learnt.root={other}",
+            ],
+            "--dyna.learnt.root" + UNKNOWN,
+        ),
+        (train, [*IMAGINED, UNCHECKED, "--env.dataset.resets=2"], "--env.dataset.resets=2: under a budget"),
+        (train, [*IMAGINED, UNCHECKED, "--env.dataset.frames=starts.npz"], "starts.npz: under a budget"),
+        (train, [*IMAGINED, STARTS, *REAL, "--selection.freq=1"], "--selection.freq=1: under a budget"),
+        (
+            train_world_model,
+            [*TOKENIZER, "--dataset.more=[{out}]"],
+            "--dataset.more={out}: no LeRobotDataset",
+        ),
+        (
+            train,
+            [*IMAGINED, STARTS, "--gate.dataset.root={out}"],
+            "--gate.dataset.root={out}: no LeRobotDataset",
+        ),
+        (
+            train,
+            [*IMAGINED, STARTS, UNCHECKED, "--dyna.rounds=1", "--dyna.dataset.roots=[{out}]"],
+            "--dyna.dataset.roots={out}: no LeRobotDataset",
+        ),
+        (train, [*SIMULATED, "--selection.freq=1"], "leave out --real_env.type, or --selection.freq"),
+        (train, [*SIMULATED, "--iterations=3"], "6 more rollouts are wanted, 5 of 5 are left"),
+        (train, [*SIMULATED, "--budget={out}/none.json"], "none.json: there is no such file; write it: "),
+    ],
+)
 def test_what_the_budget_does_not_know_is_refused(
-    command: Callable[[], None], flags: list[str], message: str, run: Any, paths: dict[str, Any],
+    command: Callable[[], None],
+    flags: list[str],
+    message: str,
+    run: Any,
+    paths: dict[str, Any],
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     before = paths["budget"].read_text()
     with pytest.raises(SystemExit) as stopped:
         run(command, "--budget={budget}", *flags)
@@ -183,22 +235,45 @@ def test_what_a_training_records_is_charged_by_the_commands_that_it_runs(
     assert all(f"--budget={paths['budget']}" in command for command in commands)
 
 
-@pytest.mark.parametrize(("command", "flags", "message"), [
-    (train_world_model, [*TOKENIZER, "--dataset.root={reported}"],
-     "--dataset.root={reported}: 2 of 6 episodes to learn from have evaluation seeds or unseen scenes, the "
-     "first is episode 2 (seed 1000007, scene 0); choose others with --dataset.episodes"),
-    (train_world_model, [*TOKENIZER, "--dataset.more=[{reported}]"], "--dataset.more={reported}: 2 of 6 ep"),
-    (train, [*IMAGINED, UNCHECKED, "--env.dataset.root={reported}", "--env.dataset.scenes=[1,3]"],
-     "--env.dataset.root={reported}: 1 of 4 episodes to learn from"),
-    (train, [*IMAGINED, UNCHECKED, "--env.dataset.root={reported}"],
-     "choose others with --env.dataset.split=ind or --env.dataset.scenes"),
-    (train, [*IMAGINED, UNCHECKED, "--env.dataset.resets=2", "--env.dataset.split=ood"],
-     "--env.dataset.split=ood: results are reported on unseen scenes"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("command", "flags", "message"),
+    [
+        (
+            train_world_model,
+            [*TOKENIZER, "--dataset.root={reported}"],
+            "--dataset.root={reported}: 2 of 6 episodes to learn from have evaluation seeds or unseen scenes"
+            ", the first is episode 2 (seed 1000007, scene 0); choose others with --dataset.episodes",
+        ),
+        (
+            train_world_model,
+            [*TOKENIZER, "--dataset.more=[{reported}]"],
+            "--dataset.more={reported}: 2 of 6 ep",
+        ),
+        (
+            train,
+            [*IMAGINED, UNCHECKED, "--env.dataset.root={reported}", "--env.dataset.scenes=[1,3]"],
+            "--env.dataset.root={reported}: 1 of 4 episodes to learn from",
+        ),
+        (
+            train,
+            [*IMAGINED, UNCHECKED, "--env.dataset.root={reported}"],
+            "choose others with --env.dataset.split=ind or --env.dataset.scenes",
+        ),
+        (
+            train,
+            [*IMAGINED, UNCHECKED, "--env.dataset.resets=2", "--env.dataset.split=ood"],
+            "--env.dataset.split=ood: results are reported on unseen scenes",
+        ),
+    ],
+)
 def test_what_is_reported_on_is_not_learnt_from(
-    command: Callable[[], None], flags: list[str], message: str, run: Any, paths: dict[str, Any],
+    command: Callable[[], None],
+    flags: list[str],
+    message: str,
+    run: Any,
+    paths: dict[str, Any],
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     with pytest.raises(SystemExit):
         run(command, *flags)
     assert message.format(**paths) in capsys.readouterr().err

@@ -63,29 +63,28 @@ class Data:
         sizes = dict.fromkeys(f"{width}x{height}" for height, width in self.cameras.values())
         longest, shortest = max(self.lengths), min(self.lengths)
         return [
-            f"{len(self.cameras)}: {', '.join(sizes)}", "video" if self.video else "images", f"{self.fps}",
-            f"{self.state or 'none'}", f"{self.action}, {self.control}" + (
-                f", {self.constant} constant" if self.constant else ""
-            ),
+            f"{len(self.cameras)}: {', '.join(sizes)}",
+            "video" if self.video else "images",
+            f"{self.fps}",
+            f"{self.state or 'none'}",
+            f"{self.action}, {self.control}" + (f", {self.constant} constant" if self.constant else ""),
             ", ".join(f"`{name}`" for name in self.labels) or "none",
             f"{longest}" if shortest == longest else f"{shortest} to {longest}",
-        ]  # fmt: skip
+        ]
 
 
 TOP, WRIST, FRONT = (f"observation.images.{name}" for name in ("top", "wrist", "front"))
 WORKS = {
     "pusht": Data({OBS_IMAGE: (96, 96)}, False, 10, 2, 2, lengths=(30, 30)),
     "webcams": Data({TOP: (480, 640), WRIST: (480, 640)}, True, 30, 6, 6, labels=("next.done",)),
-    "mixed": Data(
-        {TOP: (480, 640), WRIST: (64, 64), FRONT: (720, 1280)}, False, 5, 0, 4, "displacements", 2
-    ),
+    "mixed": Data({TOP: (480, 640), WRIST: (64, 64), FRONT: (720, 1280)}, False, 5, 0, 4, "displacements", 2),
     "bimanual": Data({TOP: (48, 64), WRIST: (48, 64)}, True, 50, 14, 14, lengths=(300, 250)),
     "humanoid": Data({FRONT: (64, 64)}, False, 30, 32, 32),
     "short": Data(
         {TOP: (32, 32)}, False, 25, 8, 7, "displacements", 4, ("next.success", "next.done"), (1, 2, 9)
     ),
     "long": Data({TOP: (32, 32)}, False, 50, 1, 1, lengths=(2000,)),
-}  # fmt: skip
+}
 
 
 SMALL = Data({TOP: (32, 32)}, False, 10, 2, 2, lengths=(8, 8))
@@ -149,12 +148,21 @@ def reinforce(
 ) -> dict[str, float]:
     """Train a policy in imagination for one iteration; return its metrics."""
     improve(
-        monkeypatch, f"--policy.path={save_policy(root, folder / 'policy')}", "--algorithm.type=ppo",
-        "--num_envs=2", "--iterations=1", "--algorithm.value_iterations=1", "--env.type=world_model",
-        f"--env.world_model_path={world_model}", f"--env.dataset.root={root}", "--env.episode_length=6",
-        "--env.reward.type=general", "--env.reward.alpha=1", "--gate.action=off",
+        monkeypatch,
+        f"--policy.path={save_policy(root, folder / 'policy')}",
+        "--algorithm.type=ppo",
+        "--num_envs=2",
+        "--iterations=1",
+        "--algorithm.value_iterations=1",
+        "--env.type=world_model",
+        f"--env.world_model_path={world_model}",
+        f"--env.dataset.root={root}",
+        "--env.episode_length=6",
+        "--env.reward.type=general",
+        "--env.reward.alpha=1",
+        "--gate.action=off",
         f"--output_dir={folder / 'rl'}",
-    )  # fmt: skip
+    )
     return read_metrics(folder / "rl")[-1]
 
 
@@ -164,9 +172,13 @@ def test_a_world_model_and_a_policy_learn_from_it(
 ) -> None:
     root = record(tmp_path / "data", WORKS[name])
     world_model = learn(root, tmp_path)
-    eval_world_model(EvalWorldModelConfig(
-        model=Checkpoint(str(world_model)), dataset=ChosenEpisodes(str(root)), output_dir=tmp_path / "check"
-    ))  # fmt: skip
+    eval_world_model(
+        EvalWorldModelConfig(
+            model=Checkpoint(str(world_model)),
+            dataset=ChosenEpisodes(str(root)),
+            output_dir=tmp_path / "check",
+        )
+    )
     metrics = reinforce(monkeypatch, root, world_model, tmp_path)
     assert metrics["step"] == 1
     assert math.isfinite(metrics["policy_loss"])
@@ -212,7 +224,7 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
         lambda root: change_rows(root, ACTION, lambda row, each: [*each, 1.0] if row > 11 else each),
         r"cannot be opened|action of episode 1, frame 4",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", SPOILED)
@@ -243,9 +255,11 @@ def test_the_page_lists_them() -> None:
 
 
 def test_without_labels_a_world_model_is_trained_but_does_not_reward(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
-) -> None:  # fmt: skip
+) -> None:
     root = record(tmp_path / "data", replace(SMALL, labels=()))
     world_model = learn(root, tmp_path)
     assert "no episode is known to succeed" in caplog.text

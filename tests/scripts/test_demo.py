@@ -25,9 +25,17 @@ ROOT = Path(__file__).parents[2]
 KILLED_STAGE = "improve/rollouts"
 STAGES = [stage.name for stage in Demo(DemoConfig()).stages()]
 IMPROVED = (
-    "rollouts", "merged", "cloned", "tokenizer", "world_model", "check", "start", "rl", "distilled",
+    "rollouts",
+    "merged",
+    "cloned",
+    "tokenizer",
+    "world_model",
+    "check",
+    "start",
+    "rl",
+    "distilled",
     "comparison",
-)  # fmt: skip
+)
 PLACES = ("in known scenes", "in unseen scenes", "in imagination, from frames of the dataset")
 HEADINGS = (
     "Success",

@@ -28,11 +28,13 @@ COMMANDS = {
     "lerobot-wmrl-record": (record.run, record.RecordConfig),
     "lerobot-wmrl-demo": (demo.run_demo, demo.DemoConfig),
     "lerobot-wmrl-eval-world-model": (
-        eval_world_model.eval_world_model, eval_world_model.EvalWorldModelConfig,
+        eval_world_model.eval_world_model,
+        eval_world_model.EvalWorldModelConfig,
     ),
     "lerobot-wmrl-train": (train.train_policy, train.TrainConfig),
     "lerobot-wmrl-train-world-model": (
-        train_world_model.train_world_model, train_world_model.TrainWorldModelConfig,
+        train_world_model.train_world_model,
+        train_world_model.TrainWorldModelConfig,
     ),
     "lerobot-wmrl-improve": (improve.improve, improve.ImproveConfig),
     "lerobot-wmrl-play": (play.play, play.PlayConfig),
@@ -41,7 +43,7 @@ COMMANDS = {
     "lerobot-wmrl-label": (label.label, label.LabelConfig),
     "lerobot-wmrl-resample": (resample.resample, resample.ResampleConfig),
     "lerobot-wmrl-convert-openvla": (convert_openvla.convert, convert_openvla.ConvertOpenVLAConfig),
-}  # fmt: skip
+}
 
 
 WITHOUT_PRESET = ("compare", "improve", "judge", "label", "openvla", "play", "resample")

@@ -67,9 +67,12 @@ def test_other_labels_are_other_data(
     found = []
     for name, episodes in {"some": "[0,1]", "others": "[2,3]", "again": "[0,1]"}.items():
         label(
-            monkeypatch, unlabelled, tmp_path / name / "labelled", "--success.type=ends",
+            monkeypatch,
+            unlabelled,
+            tmp_path / name / "labelled",
+            "--success.type=ends",
             f"--success.episodes={episodes}",
-        )  # fmt: skip
+        )
         found.append(fingerprint(tmp_path / name / "labelled"))
     assert found[0] == found[2] != found[1]
 
@@ -104,13 +107,20 @@ def test_the_others_fail_where_successes_are_named(
     assert "Every episode was taken" not in said
 
 
-@pytest.mark.parametrize("flags", [
-    ["--success.type=ends", "--success.episodes=[]"], ["--success.type=first_frames", "--success.first={}"],
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--success.type=ends", "--success.episodes=[]"],
+        ["--success.type=first_frames", "--success.first={}"],
+    ],
+)
 def test_all_may_fail_where_that_is_said(
-    flags: list[str], unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    flags: list[str],
+    unlabelled: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     found = label(monkeypatch, unlabelled, tmp_path / "labelled", *flags)
     assert not any(chain(*found))
     assert "There is no success" in capsys.readouterr().out
@@ -140,8 +150,10 @@ def test_a_reward_may_say_it(
 
 def test_frames_in_a_row_are_what_counts() -> None:
     assert [longest_run(np.array(frames, bool)) for frames in ([1, 0, 1, 0, 1], [0, 1, 1, 0, 1], [0, 0])] == [
-        1, 2, 0,
-    ]  # fmt: skip
+        1,
+        2,
+        0,
+    ]
 
 
 def test_a_reward_model_of_whole_episodes_is_refused(
@@ -149,8 +161,13 @@ def test_a_reward_model_of_whole_episodes_is_refused(
 ) -> None:
     SARMConfig(device="cpu").save_pretrained(tmp_path / "reward")
     with pytest.raises(SystemExit):
-        label(monkeypatch, unlabelled, tmp_path / "labelled", "--success.type=reward_model",
-              f"--success.path={tmp_path / 'reward'}")  # fmt: skip
+        label(
+            monkeypatch,
+            unlabelled,
+            tmp_path / "labelled",
+            "--success.type=reward_model",
+            f"--success.path={tmp_path / 'reward'}",
+        )
     assert "a reward model of type sarm does not judge frames one by one" in capsys.readouterr().err
 
 
@@ -175,26 +192,36 @@ def test_a_reward_model_may_say_it(unlabelled: Path, tmp_path: Path, monkeypatch
     assert 0 < np.sum([*chain(*found)]) < len(dataset)
 
 
-@pytest.mark.parametrize(("flags", "message"), [
-    (["--success.type=ends", "--success.episodes=[6]"], "no episode 6 in .*; it has episodes 0 to 5"),
-    (["--success.type=ends", "--success.last=0"], "--success.last=0: must be at least 1"),
-    (["--success.type=first_frames"], "--success.first: names no episode that succeeds"),
-    (["--success.type=first_frames", "--success.first={1:3}"], "write a space after each colon"),
-    (["--success.type=first_frames", "--success.first={1:45}"], "write a space after each colon"),
-    (["--success.type=first_frames", "--success.first={0: 5.5}"], "0: 5.5 is not .*give whole numbers"),
-    (["--success.type=first_frames", "--success.first={a: 5}"], "a: 5.0 is not .*give whole numbers"),
-    (["--success.type=first_frames", "--success.first={1: 99}"], "episode 1 has no frame 99; its frames are"),
-    (["--success.type=column", "--success.column=score"], "no column of one number .*next.reward"),
-    (
-        ["--success.type=column", "--success.threshold=7"],
-        "--success.threshold=7.0: no frame reaches it.*every episode fails: --success.type=ends",
-    ),
-    (["--success.type=reward_model"], "--success.path.*: no reward model of LeRobot there"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--success.type=ends", "--success.episodes=[6]"], "no episode 6 in .*; it has episodes 0 to 5"),
+        (["--success.type=ends", "--success.last=0"], "--success.last=0: must be at least 1"),
+        (["--success.type=first_frames"], "--success.first: names no episode that succeeds"),
+        (["--success.type=first_frames", "--success.first={1:3}"], "write a space after each colon"),
+        (["--success.type=first_frames", "--success.first={1:45}"], "write a space after each colon"),
+        (["--success.type=first_frames", "--success.first={0: 5.5}"], "0: 5.5 is not .*give whole numbers"),
+        (["--success.type=first_frames", "--success.first={a: 5}"], "a: 5.0 is not .*give whole numbers"),
+        (
+            ["--success.type=first_frames", "--success.first={1: 99}"],
+            "episode 1 has no frame 99; its frames are",
+        ),
+        (["--success.type=column", "--success.column=score"], "no column of one number .*next.reward"),
+        (
+            ["--success.type=column", "--success.threshold=7"],
+            "--success.threshold=7.0: no frame reaches it.*every episode fails: --success.type=ends",
+        ),
+        (["--success.type=reward_model"], "--success.path.*: no reward model of LeRobot there"),
+    ],
+)
 def test_mistakes_are_named_and_nothing_is_written(
-    flags: list[str], message: str, unlabelled: Path, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    flags: list[str],
+    message: str,
+    unlabelled: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with pytest.raises(SystemExit):
         label(monkeypatch, unlabelled, tmp_path / "labelled", *flags)
     assert list(tmp_path.iterdir()) == []
@@ -202,9 +229,11 @@ def test_mistakes_are_named_and_nothing_is_written(
 
 
 def test_labels_are_not_replaced(
-    small_dataset: LeRobotDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    small_dataset: LeRobotDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     with pytest.raises(SystemExit):
         label(monkeypatch, Path(small_dataset.root), tmp_path / "labelled")
     assert "has a column next.success already; train with it, or remove it first" in capsys.readouterr().err

@@ -41,15 +41,21 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     dataset = LeRobotDataset.create("local/fast", FPS, features, root=root, use_videos=False)
     for episode, length in enumerate(LENGTHS):
         for frame in range(length):
-            dataset.add_frame({
-                "action": np.array([0.1, 10 * frame], np.float32), "task": f"task {episode}",
-                "observation.state": np.array([frame], np.float32),
-                CAMERA: np.full((SIDE, SIDE, 3), 20 * frame, np.uint8),
-                "next.reward": np.array([1], np.float32), "next.success": np.array([frame == 3]),
-                "next.done": np.array([frame == length - 1], np.int64), "pose": np.full((2, 3), frame + 0.1),
-                "note": f"frame {frame}", "next.note": f"after {frame}",
-                "start.seed": np.array([5 + episode]),
-            })  # fmt: skip
+            dataset.add_frame(
+                {
+                    "action": np.array([0.1, 10 * frame], np.float32),
+                    "task": f"task {episode}",
+                    "observation.state": np.array([frame], np.float32),
+                    CAMERA: np.full((SIDE, SIDE, 3), 20 * frame, np.uint8),
+                    "next.reward": np.array([1], np.float32),
+                    "next.success": np.array([frame == 3]),
+                    "next.done": np.array([frame == length - 1], np.int64),
+                    "pose": np.full((2, 3), frame + 0.1),
+                    "note": f"frame {frame}",
+                    "next.note": f"after {frame}",
+                    "start.seed": np.array([5 + episode]),
+                }
+            )
         dataset.save_episode()
     dataset.finalize()
     return root
@@ -145,16 +151,23 @@ def test_videos_are_encoded_as_they_were(tmp_path: Path, monkeypatch) -> None:
     assert np.abs(255 * copied - pictures[2]).mean() < 3
 
 
-@pytest.mark.parametrize(("flags", "message"), [
-    (["--every=1"], "--every=1: must be at least 2"),
-    (["--every=3"], "--every=3: does not divide the dataset's 50 frames a second"),
-    (["--displacements=[dy]"], "--displacements=dy: the action has no such component; choose from"),
-    (["--output_dir={source}"], "there is something already"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--every=1"], "--every=1: must be at least 2"),
+        (["--every=3"], "--every=3: does not divide the dataset's 50 frames a second"),
+        (["--displacements=[dy]"], "--displacements=dy: the action has no such component; choose from"),
+        (["--output_dir={source}"], "there is something already"),
+    ],
+)
 def test_what_cannot_be_is_refused(
-    flags: list[str], message: str, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    flags: list[str],
+    message: str,
+    source: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     given = [flag.format(source=source) for flag in flags]
     with pytest.raises(SystemExit):
         resample(monkeypatch, f"--dataset.root={source}", f"--output_dir={tmp_path / 'slow'}", *given)

@@ -53,10 +53,18 @@ def cloned(small_dataset: LeRobotDataset, tmp_path_factory: pytest.TempPathFacto
     """The output folder of four steps of lerobot-train."""
     output_dir = tmp_path_factory.mktemp("clone") / "sft"
     run_here(
-        "lerobot-train", "--policy.type=cnn", "--policy.push_to_hub=false", "--policy.device=cpu",
-        "--dataset.repo_id=local/synthetic", f"--dataset.root={small_dataset.root}", "--steps=4",
-        "--batch_size=4", "--num_workers=0", "--env_eval_freq=0", f"--output_dir={output_dir}",
-    )  # fmt: skip
+        "lerobot-train",
+        "--policy.type=cnn",
+        "--policy.push_to_hub=false",
+        "--policy.device=cpu",
+        "--dataset.repo_id=local/synthetic",
+        f"--dataset.root={small_dataset.root}",
+        "--steps=4",
+        "--batch_size=4",
+        "--num_workers=0",
+        "--env_eval_freq=0",
+        f"--output_dir={output_dir}",
+    )
     return output_dir
 
 
@@ -209,17 +217,23 @@ def test_a_finished_training_of_something_else_is_refused(
     assert "holds something else" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("flags", "message"), [
-    (["--policy.path={tmp}/policy", *POINT], "needs observation.images.wrist, which"),
-    (["--policy.path={tmp}/policy", *POINT, "--output_dir={tmp}/policy"], "holds something else"),
-    (["--policy.path={tmp}/policy", *POINT, "--algorithm.clip=0"], "--algorithm.clip=0"),
-    (POINT, "--policy.path: give the checkpoint"),
-    (["--policy.path={tmp}/policy", *POINT, "--policy.push_to_hub=true"], "hub, --policy.repo_id"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--policy.path={tmp}/policy", *POINT], "needs observation.images.wrist, which"),
+        (["--policy.path={tmp}/policy", *POINT, "--output_dir={tmp}/policy"], "holds something else"),
+        (["--policy.path={tmp}/policy", *POINT, "--algorithm.clip=0"], "--algorithm.clip=0"),
+        (POINT, "--policy.path: give the checkpoint"),
+        (["--policy.path={tmp}/policy", *POINT, "--policy.push_to_hub=true"], "hub, --policy.repo_id"),
+    ],
+)
 def test_bad_input_is_named_and_nothing_is_written(
-    flags: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    flags: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     save_untrained_policy(tmp_path / "policy", camera="third_view" if "holds" in message else "wrist")
     before = sorted(tmp_path.rglob("*"))
     given = [flag.format(tmp=tmp_path) for flag in flags]
@@ -230,21 +244,31 @@ def test_bad_input_is_named_and_nothing_is_written(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize(("settings", "message"), [
-    ({"env": None}, r"env\.type"), ({"num_envs": 0}, "num_envs=0"), ({"seed": -1}, "seed=-1"),
-    ({"seed": 1_000_000}, "seed=1000000"),
-    ({"num_envs": 12, "algorithm": GRPOConfig(group_size=8)}, r"num_envs=12: must be a multiple of"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"env": None}, r"env\.type"),
+        ({"num_envs": 0}, "num_envs=0"),
+        ({"seed": -1}, "seed=-1"),
+        ({"seed": 1_000_000}, "seed=1000000"),
+        ({"num_envs": 12, "algorithm": GRPOConfig(group_size=8)}, r"num_envs=12: must be a multiple of"),
+    ],
+)
 def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         TrainConfig(**{"env": PointConfig(), **settings}).validate()
 
 
-@pytest.mark.parametrize(("flags", "warned"), [
-    ({}, False), ({"gamma": 0.9}, True), ({"gamma": 0.9, "reward": RuleBasedReward(gamma=0.9)}, False),
-    ({"gamma": 0.9, "reward": RuleBasedReward(alpha=1.0)}, False),
-    ({"gamma": 0.9, "reward": RuleBasedReward(form="absolute")}, False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("flags", "warned"),
+    [
+        ({}, False),
+        ({"gamma": 0.9}, True),
+        ({"gamma": 0.9, "reward": RuleBasedReward(gamma=0.9)}, False),
+        ({"gamma": 0.9, "reward": RuleBasedReward(alpha=1.0)}, False),
+        ({"gamma": 0.9, "reward": RuleBasedReward(form="absolute")}, False),
+    ],
+)
 def test_another_discount_of_progress_than_ppos_is_warned_of(
     flags: dict[str, Any], warned: bool, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -27,21 +27,32 @@ from tests.rl.point_env import PointEnv
 
 WEIGHTS = "pretrained_model/model.safetensors"
 SHORT = [
-    "--algorithm.type=ppo", "--num_envs=2", "--iterations=2", "--save_freq=2",
+    "--algorithm.type=ppo",
+    "--num_envs=2",
+    "--iterations=2",
+    "--save_freq=2",
     "--algorithm.value_iterations=0",
-]  # fmt: skip
+]
 POINT = ["--policy.path={pointing}", "--env.type=test_evaluable_point"]
 IMAGINED = [
-    "--env.type=world_model", "--env.world_model_path={action_world_model}", "--env.reward.type=general",
-    "--env.reward.alpha=1", "--env.dataset.root={data}", "--env.episode_length=4", "--env.done_frames=1",
+    "--env.type=world_model",
+    "--env.world_model_path={action_world_model}",
+    "--env.reward.type=general",
+    "--env.reward.alpha=1",
+    "--env.dataset.root={data}",
+    "--env.episode_length=4",
+    "--env.done_frames=1",
     "--env.device=cpu",
-]  # fmt: skip
+]
 PUSH = ["--policy.path={pushing}", *IMAGINED]
 ADAPTERS = ["--peft.method_type=LORA", "--peft.target_modules=[actor.0]"]
 SIMULATOR = [
-    "--real_env.type=wmrl_maniskill", "--real_env.image_size=32", "--real_env.episode_length=3",
-    "--real_env.scenes=[0]", "--real_num_envs=1",
-]  # fmt: skip
+    "--real_env.type=wmrl_maniskill",
+    "--real_env.image_size=32",
+    "--real_env.episode_length=3",
+    "--real_env.scenes=[0]",
+    "--real_num_envs=1",
+]
 
 
 @EnvConfig.register_subclass("test_evaluable_point")
@@ -61,10 +72,12 @@ class EvaluablePointConfig(EnvConfig):
 def paths(trained_models: dict[str, Path], small_dataset: LeRobotDataset, tmp_path: Path) -> dict[str, Any]:
     """What flags may name: models, data, two policies, an output folder."""
     return {
-        **trained_models, "data": small_dataset.root, "out": tmp_path / "rl",
+        **trained_models,
+        "data": small_dataset.root,
+        "out": tmp_path / "rl",
         "pointing": save_untrained_policy(tmp_path / "pointing"),
         "pushing": save_untrained_policy(tmp_path / "pushing", actions=7),
-    }  # fmt: skip
+    }
 
 
 @pytest.fixture
@@ -115,11 +128,17 @@ def test_settings_of_the_policy_may_stand_in_a_file_and_flags_come_before_a_stor
 ) -> None:
     for kept in ("_config_path_args", "_config_yaml_overrides"):  # by LeRobot, until the process ends
         monkeypatch.setattr(parser, kept, {})
-    given = {"policy": {
-        "path": str(paths["pointing"]), "type": "cnn", "max_shift": 1, "optimizer_lr": 0.5,
-        "tags": ["a", "b"],
-        "license": None, "normalization_mapping": {"STATE": "MIN_MAX"},
-    }}  # fmt: skip
+    given = {
+        "policy": {
+            "path": str(paths["pointing"]),
+            "type": "cnn",
+            "max_shift": 1,
+            "optimizer_lr": 0.5,
+            "tags": ["a", "b"],
+            "license": None,
+            "normalization_mapping": {"STATE": "MIN_MAX"},
+        }
+    }
     (tmp_path / "run.yaml").write_text(yaml.dump(given))
     flags = [*POINT[1:], *SHORT, "--output_dir={out}"]
     out = improve(f"--config_path={tmp_path / 'run.yaml'}", *flags)
@@ -179,9 +198,16 @@ def test_the_gate_is_asked_before_the_first_update(improve: Any, capsys: pytest.
 def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
     """Fresh rollouts are asked about, and real success stands beside imagined."""
     out = improve(
-        *PUSH, *SHORT, *SIMULATOR, "--output_dir={out}", "--gate.action=warn", "--gate.freq=0",
-        "--gate.n_episodes=1", "--selection.freq=2", "--selection.n_episodes=1",
-    )  # fmt: skip
+        *PUSH,
+        *SHORT,
+        *SIMULATOR,
+        "--output_dir={out}",
+        "--gate.action=warn",
+        "--gate.freq=0",
+        "--gate.n_episodes=1",
+        "--selection.freq=2",
+        "--selection.n_episodes=1",
+    )
     first, *_, last = read_metrics(out)
     assert (last["real_steps/gate"], last["real_steps/selection"]) == (3, 6)
     assert last["selection/real/n"] == last["selection/imagined/n"] == 1
@@ -191,35 +217,68 @@ def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
     assert rollouts.columns[START_SEED].tolist() == [GATE_SEED]
 
 
-@pytest.mark.parametrize(("flags", "message"), [
-    (PUSH, "--gate.action=stop: no episode says what success is"),
-    ([*PUSH, "--gate.action=halt"], "--gate.action=halt: choose one of stop"),
-    ([*PUSH, "--gate.limit=2"], "--gate.limit=2"),
-    ([*PUSH, "--env.done_frames=5"], "no episode could succeed"),
-    ([*PUSH, *SIMULATOR, "--real_env.image_size=1"], "--real_env.image_size=1: must be at least 16"),
-    ([*PUSH, *SIMULATOR, "--real_env.image_size=64"], "real_env has (3, 64, 64)"),
-    ([*PUSH, *SIMULATOR, "--real_env.cameras=[wrist]"], "which real_env does not have"),
-    ([*PUSH, *SIMULATOR, "--dyna.rounds=2"], "--dyna.rounds=2: there is room for 1"),
-    ([*PUSH, "--gate.action=off", "--dyna.rounds=1"], "give an environment to record in (--real_env.type"),
-    ([*PUSH, "--gate.action=off", "--dyna.rounds=1", "--dyna.dataset.roots=[]", "--dyna.learnt.root={out}"],
-     "rl: no LeRobotDataset there"),
-    ([*PUSH, "--env.dataset.split=known", "--gate.action=off"], "--env.dataset.split=known: choose one of"),
-    ([*PUSH, "--env.device=cuda", "--gate.action=off"], "--env.device=cuda: the policy is on cpu"),
-    (["--policy.path={pointing}", *IMAGINED, "--gate.action=off"], "has 3 action components, the environ"),
-    ([*POINT, "--dyna.rounds=1"], "no world model to refresh"),
-    ([*POINT, "--selection.freq=-1"], "--selection.freq=-1: must be at least 0"),
-    ([*POINT, "--resume=true"], "--resume=true: there is no checkpoint in"),
-    ([*POINT, "--algorithm.clipp=0.3"], "there is no flag --algorithm.clipp: did you mean --algorithm.clip?"),
-    ([*POINT, "--policy.shifts=1"], "unrecognized arguments: --shifts=1\nerror: --policy.path="),
-    ([*POINT, "--num_envs=0"], "--num_envs=0: must be at least 1"),
-    ([*POINT, *ADAPTERS, "--peft.full_training_modules=[encoder]"],
-     "--peft.full_training_modules: adapters leave the value function"),
-    ([*POINT, *ADAPTERS, "--algorithm.initial_std=0.1"],
-     "--algorithm.initial_std=0.1: is none of the adapters' parameters"),
-    ([*POINT, "--peft.method_type=LORA", "--peft.target_modules=.*encoder.*grid.*",
-      "--algorithm.train_encoder=false"],
-     "--algorithm.train_encoder=false: leaves nothing of the policy to train"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (PUSH, "--gate.action=stop: no episode says what success is"),
+        ([*PUSH, "--gate.action=halt"], "--gate.action=halt: choose one of stop"),
+        ([*PUSH, "--gate.limit=2"], "--gate.limit=2"),
+        ([*PUSH, "--env.done_frames=5"], "no episode could succeed"),
+        ([*PUSH, *SIMULATOR, "--real_env.image_size=1"], "--real_env.image_size=1: must be at least 16"),
+        ([*PUSH, *SIMULATOR, "--real_env.image_size=64"], "real_env has (3, 64, 64)"),
+        ([*PUSH, *SIMULATOR, "--real_env.cameras=[wrist]"], "which real_env does not have"),
+        ([*PUSH, *SIMULATOR, "--dyna.rounds=2"], "--dyna.rounds=2: there is room for 1"),
+        (
+            [*PUSH, "--gate.action=off", "--dyna.rounds=1"],
+            "give an environment to record in (--real_env.type",
+        ),
+        (
+            [
+                *PUSH,
+                "--gate.action=off",
+                "--dyna.rounds=1",
+                "--dyna.dataset.roots=[]",
+                "--dyna.learnt.root={out}",
+            ],
+            "rl: no LeRobotDataset there",
+        ),
+        (
+            [*PUSH, "--env.dataset.split=known", "--gate.action=off"],
+            "--env.dataset.split=known: choose one of",
+        ),
+        ([*PUSH, "--env.device=cuda", "--gate.action=off"], "--env.device=cuda: the policy is on cpu"),
+        (
+            ["--policy.path={pointing}", *IMAGINED, "--gate.action=off"],
+            "has 3 action components, the environ",
+        ),
+        ([*POINT, "--dyna.rounds=1"], "no world model to refresh"),
+        ([*POINT, "--selection.freq=-1"], "--selection.freq=-1: must be at least 0"),
+        ([*POINT, "--resume=true"], "--resume=true: there is no checkpoint in"),
+        (
+            [*POINT, "--algorithm.clipp=0.3"],
+            "there is no flag --algorithm.clipp: did you mean --algorithm.clip?",
+        ),
+        ([*POINT, "--policy.shifts=1"], "unrecognized arguments: --shifts=1\nerror: --policy.path="),
+        ([*POINT, "--num_envs=0"], "--num_envs=0: must be at least 1"),
+        (
+            [*POINT, *ADAPTERS, "--peft.full_training_modules=[encoder]"],
+            "--peft.full_training_modules: adapters leave the value function",
+        ),
+        (
+            [*POINT, *ADAPTERS, "--algorithm.initial_std=0.1"],
+            "--algorithm.initial_std=0.1: is none of the adapters' parameters",
+        ),
+        (
+            [
+                *POINT,
+                "--peft.method_type=LORA",
+                "--peft.target_modules=.*encoder.*grid.*",
+                "--algorithm.train_encoder=false",
+            ],
+            "--algorithm.train_encoder=false: leaves nothing of the policy to train",
+        ),
+    ],
+)
 def test_bad_input_is_named_and_nothing_is_written(
     flags: list[str], message: str, improve: Any, paths: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -45,16 +45,28 @@ def test_every_preset_trains_for_four_steps_on_few_small_frames(
 
 @pytest.mark.parametrize("model", ["action_world_model", "text_world_model"])
 def test_training_goes_on_with_the_weights_and_settings_of_a_checkpoint(
-    model: str, trained_models: dict[str, Path], small_dataset, tmp_path: Path,
+    model: str,
+    trained_models: dict[str, Path],
+    small_dataset,
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     """At a learning rate of next to nothing, one step later they are the same."""
     output_dir = tmp_path / "further"
-    monkeypatch.setattr(sys, "argv", [
-        "lerobot-wmrl-train-world-model", f"--model.path={trained_models[model]}", "--precision=float32",
-        "--model.learning_rate=1e-12", f"--dataset.root={small_dataset.root}", "--steps=1", "--batch_size=2",
-        f"--output_dir={output_dir}",
-    ])  # fmt: skip
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        [
+            "lerobot-wmrl-train-world-model",
+            f"--model.path={trained_models[model]}",
+            "--precision=float32",
+            "--model.learning_rate=1e-12",
+            f"--dataset.root={small_dataset.root}",
+            "--steps=1",
+            "--batch_size=2",
+            f"--output_dir={output_dir}",
+        ],
+    )
     main()
     before, after = (
         load_file(folder / TRAINED / "model.safetensors") for folder in (trained_models[model], output_dir)
@@ -69,10 +81,16 @@ def test_training_goes_on_with_the_weights_and_settings_of_a_checkpoint(
 def test_a_path_without_a_model_is_named(
     tmp_path: Path, small_dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", [
-        "lerobot-wmrl-train-world-model", f"--model.path={tmp_path}", f"--dataset.root={small_dataset.root}",
-        f"--output_dir={tmp_path / 'new'}",
-    ])  # fmt: skip
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        [
+            "lerobot-wmrl-train-world-model",
+            f"--model.path={tmp_path}",
+            f"--dataset.root={small_dataset.root}",
+            f"--output_dir={tmp_path / 'new'}",
+        ],
+    )
     with pytest.raises(SystemExit) as stopped:
         main()
     assert stopped.value.code == 1
@@ -80,24 +98,46 @@ def test_a_path_without_a_model_is_named(
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize(("settings", "message"), [
-    (["--model.dynamics.layers=3"], r"weights do not fit the settings \(.*Missing key.*leave the sizes"),
-    (["--model.dynamics.width=64"], r"weights do not fit the settings \(.*size mismatch.*leave the sizes"),
-    (["--model.shifts=1"], r"(?s)unrecognized arguments: --shifts=1.*has not all of the settings"),
-    (["--model.dynamics.type=autoregressive"], r"cannot be trained further with --dynamics\.type=autoreg"),
-    (
-        [f"--model.embodiment.action_low={[1] * 7}", f"--model.embodiment.action_high={[0] * 7}"],
-        r"embodiment\.action_low=.* would range from 1.0 to 0.0; give finite numbers",
-    ),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["--model.dynamics.layers=3"], r"weights do not fit the settings \(.*Missing key.*leave the sizes"),
+        (
+            ["--model.dynamics.width=64"],
+            r"weights do not fit the settings \(.*size mismatch.*leave the sizes",
+        ),
+        (["--model.shifts=1"], r"(?s)unrecognized arguments: --shifts=1.*has not all of the settings"),
+        (
+            ["--model.dynamics.type=autoregressive"],
+            r"cannot be trained further with --dynamics\.type=autoreg",
+        ),
+        (
+            [f"--model.embodiment.action_low={[1] * 7}", f"--model.embodiment.action_high={[0] * 7}"],
+            r"embodiment\.action_low=.* would range from 1.0 to 0.0; give finite numbers",
+        ),
+    ],
+)
 def test_settings_that_do_not_fit_the_weights_are_refused(
-    settings: list[str], message: str, trained_models: dict[str, Path], small_dataset, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    monkeypatch.setattr(sys, "argv", [
-        "lerobot-wmrl-train-world-model", f"--model.path={trained_models['action_world_model']}", *settings,
-        f"--dataset.root={small_dataset.root}", "--batch_size=2", f"--output_dir={tmp_path / 'new'}",
-    ])  # fmt: skip
+    settings: list[str],
+    message: str,
+    trained_models: dict[str, Path],
+    small_dataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        [
+            "lerobot-wmrl-train-world-model",
+            f"--model.path={trained_models['action_world_model']}",
+            *settings,
+            f"--dataset.root={small_dataset.root}",
+            "--batch_size=2",
+            f"--output_dir={tmp_path / 'new'}",
+        ],
+    )
     with pytest.raises(SystemExit):
         main()
     assert re.search(message, capsys.readouterr().err)
@@ -105,17 +145,27 @@ def test_settings_that_do_not_fit_the_weights_are_refused(
 
 
 def test_weights_that_are_truncated_are_named(
-    trained_models: dict[str, Path], small_dataset, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    trained_models: dict[str, Path],
+    small_dataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     torn = tmp_path / "torn"
     shutil.copytree(trained_models["action_world_model"] / TRAINED, torn)
     weights = torn / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:1000])
-    monkeypatch.setattr(sys, "argv", [
-        "lerobot-wmrl-train-world-model", f"--model.path={torn}", f"--dataset.root={small_dataset.root}",
-        "--batch_size=2", f"--output_dir={tmp_path / 'new'}",
-    ])  # fmt: skip
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        [
+            "lerobot-wmrl-train-world-model",
+            f"--model.path={torn}",
+            f"--dataset.root={small_dataset.root}",
+            "--batch_size=2",
+            f"--output_dir={tmp_path / 'new'}",
+        ],
+    )
     with pytest.raises(SystemExit):
         main()
     assert f"{torn}: model.safetensors cannot be read" in capsys.readouterr().err
@@ -148,11 +198,18 @@ def test_frames_have_the_size_of_those_that_were_learnt_last(
     trained_models: dict[str, Path], make_synthetic_dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     larger = make_synthetic_dataset(tmp_path / "larger", episodes=4, size=48)
-    monkeypatch.setattr(sys, "argv", [
-        "lerobot-wmrl-train-world-model", f"--model.path={trained_models['action_world_model']}",
-        f"--dataset.root={larger.root}", "--steps=1", "--batch_size=2",
-        f"--output_dir={tmp_path / 'further'}",
-    ])  # fmt: skip
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        [
+            "lerobot-wmrl-train-world-model",
+            f"--model.path={trained_models['action_world_model']}",
+            f"--dataset.root={larger.root}",
+            "--steps=1",
+            "--batch_size=2",
+            f"--output_dir={tmp_path / 'further'}",
+        ],
+    )
     main()
     model = load_model(tmp_path / "further", "action_world_model")
     assert model.config.observation_shapes["observation.images.third_view"] == (3, 48, 48)
@@ -160,17 +217,27 @@ def test_frames_have_the_size_of_those_that_were_learnt_last(
 
 def flags(root: Path, output_dir: Path, *more: str) -> list[str]:
     return [
-        "lerobot-wmrl-train-world-model", "--model.type=frame_tokenizer", "--model.device=cpu",
-        "--model.tokenizer.image_size=32", "--model.tokenizer.widths=[8,16]",
-        "--model.tokenizer.levels=[5,4]", f"--dataset.root={root}", f"--output_dir={output_dir}",
-        "--steps=2", "--batch_size=2", *more,
-    ]  # fmt: skip
+        "lerobot-wmrl-train-world-model",
+        "--model.type=frame_tokenizer",
+        "--model.device=cpu",
+        "--model.tokenizer.image_size=32",
+        "--model.tokenizer.widths=[8,16]",
+        "--model.tokenizer.levels=[5,4]",
+        f"--dataset.root={root}",
+        f"--output_dir={output_dir}",
+        "--steps=2",
+        "--batch_size=2",
+        *more,
+    ]
 
 
 def test_a_training_ends_with_what_it_made_how_good_it_is_and_what_comes_next(
-    trained_models: dict[str, Path], make_synthetic_dataset, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    trained_models: dict[str, Path],
+    make_synthetic_dataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """Of twenty episodes the last is held out."""
     root, tokenizer = (
         Path(make_synthetic_dataset(tmp_path / "data", episodes=20).root),
@@ -212,9 +279,16 @@ def test_a_run_is_resumed_where_there_is_one(
     monkeypatch.setattr(sys, "argv", given)
     main()
     for stored in (tmp_path / "run", tmp_path / "run" / TRAINED):
-        monkeypatch.setattr(sys, "argv", [
-            given[0], f"--config_path={stored / 'train_config.json'}", "--resume=true", "--job_name=again",
-        ])  # fmt: skip
+        monkeypatch.setattr(
+            sys,
+            "argv",
+            [
+                given[0],
+                f"--config_path={stored / 'train_config.json'}",
+                "--resume=true",
+                "--job_name=again",
+            ],
+        )
         main()
         assert f"{tmp_path / 'run'}: already trained for 2 steps" in capsys.readouterr().out
     other = not precision.multiplies_bfloat16("cpu")

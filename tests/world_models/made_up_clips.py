@@ -24,12 +24,21 @@ def text_model(**settings: Any) -> TextWorldModelRewardModel:
     """A small text world model with random weights; no tokenizer is trained, as no picture is looked at."""
     torch.manual_seed(0)
     config = TextWorldModelConfig(
-        tokenizer=small_tokenizer(levels=LEVELS), state_size=STATE, device="cpu",
-        **nested({
-            **SIZES, "dynamics": "autoregressive", "conditioning": "cross_attention", "window": 8,
-            "self_forcing": 0.0, "goal_horizon": 6, **settings,
-        }),
-    )  # fmt: skip
+        tokenizer=small_tokenizer(levels=LEVELS),
+        state_size=STATE,
+        device="cpu",
+        **nested(
+            {
+                **SIZES,
+                "dynamics": "autoregressive",
+                "conditioning": "cross_attention",
+                "window": 8,
+                "self_forcing": 0.0,
+                "goal_horizon": 6,
+                **settings,
+            }
+        ),
+    )
     return TextWorldModelRewardModel(config)
 
 

@@ -34,10 +34,14 @@ from tests.trained import nested, small_tokenizer
 BATCH, LENGTH, TOKENS, CODES = 3, 6, 32, 20
 CAMERAS = ["third_view", "wrist"]
 SIZES: dict[str, Any] = {
-    "device": "cpu", "tokenizer": small_tokenizer(cameras=CAMERAS, context=True),
-    "layers": 2, "width": 32, "heads": 2, "code_width": 8,
+    "device": "cpu",
+    "tokenizer": small_tokenizer(cameras=CAMERAS, context=True),
+    "layers": 2,
+    "width": 32,
+    "heads": 2,
+    "code_width": 8,
     "clip_length": LENGTH,
-}  # fmt: skip
+}
 
 
 def world_model(**settings: Any) -> ActionWorldModelRewardModel:
@@ -54,9 +58,15 @@ def random_clip(seed: int = 0, length: int = LENGTH) -> Clip:
     yes = torch.ones(BATCH, length, dtype=torch.bool)
     tokens, state = torch.randint(0, CODES, (BATCH, length, TOKENS)), torch.randn(BATCH, length, 8)
     return Clip(
-        tokens, state, torch.randn(BATCH, length, 7), torch.zeros(BATCH, length), yes, yes, [""] * BATCH,
+        tokens,
+        state,
+        torch.randn(BATCH, length, 7),
+        torch.zeros(BATCH, length),
+        yes,
+        yes,
+        [""] * BATCH,
         context=Context((torch.randn(BATCH, 2, 16, 4, 4),)),
-    )  # fmt: skip
+    )
 
 
 def imagine(model: ActionWorldModelRewardModel, clip: Clip) -> list[Imagined]:

@@ -83,10 +83,15 @@ def test_another_dataset_than_the_tokenizers_is_named(make_synthetic_dataset, tr
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("setting", "message"), [
-    ({"patch": 3}, r"dynamics\.patch=3: must divide"), ({"heads": 3}, r"dynamics\.width=32: must be"),
-    ({"clip_length": 1}, r"clip_length=1: must be"), ({"state_size": -1}, r"state_size=-1: must be"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"patch": 3}, r"dynamics\.patch=3: must divide"),
+        ({"heads": 3}, r"dynamics\.width=32: must be"),
+        ({"clip_length": 1}, r"clip_length=1: must be"),
+        ({"state_size": -1}, r"state_size=-1: must be"),
+    ],
+)
 def test_impossible_sizes_are_named(setting, message, small_dataset, trained_models, tmp_path):
     with pytest.raises(ValueError, match=message):
         run_training(
@@ -137,10 +142,13 @@ def test_a_corrupted_episode_file_is_named_and_may_be_copied_again(small_dataset
     np.testing.assert_array_equal(*frames)
 
 
-@pytest.mark.parametrize(("pattern", "message"), [
-    ("*.mp4", r"1 files are missing, the first is videos/.*mp4"),
-    ("data/**/*.parquet", r"1 files are missing, the first is data/.*parquet"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("pattern", "message"),
+    [
+        ("*.mp4", r"1 files are missing, the first is videos/.*mp4"),
+        ("data/**/*.parquet", r"1 files are missing, the first is data/.*parquet"),
+    ],
+)
 def test_a_missing_file_is_named_and_not_downloaded(pattern, message, small_dataset, tmp_path):
     root = tmp_path / "dataset"
     shutil.copytree(small_dataset.root, root)
@@ -228,12 +236,19 @@ def test_a_camera_that_a_further_dataset_lacks_is_named_with_it(
     small_dataset, make_synthetic_dataset, tmp_path, capsys, monkeypatch
 ):
     other = make_synthetic_dataset(tmp_path / "other", episodes=2, length=5, cameras=("wrist",)).root
-    monkeypatch.setattr("sys.argv", [
-        "lerobot-wmrl-train-world-model", "--model.type=frame_tokenizer", "--model.device=cpu",
-        "--model.tokenizer.cameras=[third_view]", "--model.tokenizer.image_size=32",
-        f"--dataset.root={small_dataset.root}", f"--dataset.more=[{other}]",
-        f"--output_dir={tmp_path / 'run'}",
-    ])  # fmt: skip
+    monkeypatch.setattr(
+        "sys.argv",
+        [
+            "lerobot-wmrl-train-world-model",
+            "--model.type=frame_tokenizer",
+            "--model.device=cpu",
+            "--model.tokenizer.cameras=[third_view]",
+            "--model.tokenizer.image_size=32",
+            f"--dataset.root={small_dataset.root}",
+            f"--dataset.more=[{other}]",
+            f"--output_dir={tmp_path / 'run'}",
+        ],
+    )
     with pytest.raises(SystemExit):
         train_world_model.main()
     assert (

@@ -114,10 +114,12 @@ def test_a_missing_superfluous_or_short_context_is_named():
     tokens = plain.encode(frames)
     assert plain.context(start) is NO_CONTEXT
     for call in (
-        lambda: conditioned.encode(frames), lambda: conditioned.decode(tokens),
-        lambda: conditioned(frames), lambda: conditioned.decode(tokens, context[:3]),
+        lambda: conditioned.encode(frames),
+        lambda: conditioned.decode(tokens),
+        lambda: conditioned(frames),
+        lambda: conditioned.decode(tokens, context[:3]),
         lambda: plain.encode(frames, context),
-    ):  # fmt: skip
+    ):
         with pytest.raises(ValueError, match=r"the context of \d+ first frames: this tokenizer needs"):
             call()
 
@@ -156,8 +158,9 @@ def test_environments_decode_beside_their_own_start_also_after_a_restart(models,
     config = WorldModelEnv(
         world_model_path=str(models["action_world_model"]),
         text_world_model_path=str(models["text_world_model"]),
-        dataset=StartFrames(str(small_dataset.root), split="all"), episode_length=3,
-    )  # fmt: skip
+        dataset=StartFrames(str(small_dataset.root), split="all"),
+        episode_length=3,
+    )
     env = config.create_tensor_env(4)
     starts = env.starts
     assert len(starts.frames.context) == len(starts)
@@ -219,9 +222,10 @@ def test_evaluation_decodes_beside_the_start_and_runs_whole(models, small_datase
         EvalWorldModelConfig(
             model=Checkpoint(str(models["action_world_model"])),
             text_model=Checkpoint(str(models["text_world_model"])),
-            dataset=ChosenEpisodes(str(small_dataset.root)), output_dir=tmp_path / "evaluation",
+            dataset=ChosenEpisodes(str(small_dataset.root)),
+            output_dir=tmp_path / "evaluation",
         )
-    )  # fmt: skip
+    )
     assert (tmp_path / "evaluation" / "goal_frames.png").is_file()
 
 

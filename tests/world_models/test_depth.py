@@ -18,11 +18,16 @@ from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewar
 from tests.trained import nested, small_tokenizer
 
 SIZES: dict[str, Any] = {
-    "device": "cpu", "dynamics": "autoregressive",
+    "device": "cpu",
+    "dynamics": "autoregressive",
     "tokenizer": small_tokenizer(cameras=["third_view", "wrist"]),
-    "layers": 2, "width": 32, "heads": 2, "window": 4, "code_width": 8,
+    "layers": 2,
+    "width": 32,
+    "heads": 2,
+    "window": 4,
+    "code_width": 8,
     "depth": True,
-}  # fmt: skip
+}
 BATCH, TOKENS, CODES, FRAMES = 3, 32, 20, 12
 CHANGED = 5
 
@@ -44,10 +49,15 @@ def random_clip() -> Clip:
     torch.manual_seed(1)
     known = torch.ones(BATCH, FRAMES, dtype=torch.bool)
     return Clip(
-        torch.randint(0, CODES, (BATCH, FRAMES, TOKENS)), torch.randn(BATCH, FRAMES, 8),
-        torch.randn(BATCH, FRAMES, 7), torch.zeros(BATCH, FRAMES), known, known, [""] * BATCH,
+        torch.randint(0, CODES, (BATCH, FRAMES, TOKENS)),
+        torch.randn(BATCH, FRAMES, 8),
+        torch.randn(BATCH, FRAMES, 7),
+        torch.zeros(BATCH, FRAMES),
+        known,
+        known,
+        [""] * BATCH,
         FAR * torch.rand(BATCH, FRAMES, TOKENS),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -154,9 +164,15 @@ def moving_depth_clip() -> Clip:
     action = torch.zeros(batch, length, 7)
     action[..., 0] = moves
     return Clip(
-        torch.full(depth.shape, 3), torch.zeros(batch, length, 0), action, torch.zeros(batch, length), known,
-        known, [""] * batch, depth,
-    )  # fmt: skip
+        torch.full(depth.shape, 3),
+        torch.zeros(batch, length, 0),
+        action,
+        torch.zeros(batch, length),
+        known,
+        known,
+        [""] * batch,
+        depth,
+    )
 
 
 def test_a_moving_depth_is_learnt_and_imagined():

@@ -26,20 +26,31 @@ TRAINED_WEIGHTS = "checkpoints/last/pretrained_model/model.safetensors"
 PROCESSES, STEPS, BATCH = 2, 6, 8
 SIZES = {
     "frame_tokenizer": [
-        "--model.tokenizer.image_size=32", "--model.tokenizer.widths=[8,16]",
+        "--model.tokenizer.image_size=32",
+        "--model.tokenizer.widths=[8,16]",
         "--model.tokenizer.levels=[5,4]",
     ],
     "action_world_model": [
-        "--model.dynamics.type=autoregressive", "--model.dynamics.layers=1", "--model.dynamics.width=32",
-        "--model.dynamics.heads=2", "--model.dynamics.code_width=8", "--model.clip_length=14",
-        "--model.dynamics.self_rollout=0.5", "--model.dynamics.keypoint_weight=1",
+        "--model.dynamics.type=autoregressive",
+        "--model.dynamics.layers=1",
+        "--model.dynamics.width=32",
+        "--model.dynamics.heads=2",
+        "--model.dynamics.code_width=8",
+        "--model.clip_length=14",
+        "--model.dynamics.self_rollout=0.5",
+        "--model.dynamics.keypoint_weight=1",
     ],
     "text_world_model": [
-        "--model.dynamics.type=anchored", "--model.dynamics.layers=1", "--model.dynamics.width=32",
-        "--model.dynamics.heads=2", "--model.dynamics.code_width=8", "--model.clip_length=14",
-        "--model.dynamics.dropout=0.1", "--model.state_size=0",
+        "--model.dynamics.type=anchored",
+        "--model.dynamics.layers=1",
+        "--model.dynamics.width=32",
+        "--model.dynamics.heads=2",
+        "--model.dynamics.code_width=8",
+        "--model.clip_length=14",
+        "--model.dynamics.dropout=0.1",
+        "--model.state_size=0",
     ],
-}  # fmt: skip
+}
 
 RUNNING = ("running_mean", "running_var", "num_batches_tracked")
 """Statistics of the training frames, which batch normalisation keeps."""
@@ -49,10 +60,18 @@ def flags(model: str, root: Path, tokenizer: Path, output_dir: Path, batch: int)
     """Flags of a training in which every process draws `batch` rows a step."""
     source = [] if model == "frame_tokenizer" else [f"--model.tokenizer_path={tokenizer}"]
     return [
-        f"--model.type={model}", "--model.device=cpu", *source, *SIZES[model], f"--dataset.root={root}",
-        f"--output_dir={output_dir}", f"--batch_size={batch}", f"--steps={STEPS}",
-        "--log_freq=1", "--save_freq=3", "--precision=float32",
-    ]  # fmt: skip
+        f"--model.type={model}",
+        "--model.device=cpu",
+        *source,
+        *SIZES[model],
+        f"--dataset.root={root}",
+        f"--output_dir={output_dir}",
+        f"--batch_size={batch}",
+        f"--steps={STEPS}",
+        "--log_freq=1",
+        "--save_freq=3",
+        "--precision=float32",
+    ]
 
 
 def parsed(*arguments: Any) -> TrainWorldModelConfig:
@@ -115,8 +134,10 @@ def test_two_processes_average_their_gradients(
         if not name.endswith(RUNNING):  # those of the first process
             torch.testing.assert_close(value, expected[name], rtol=1e-3, atol=1e-5)
     assert sorted(path.name for path in (trained_by_two / model / "checkpoints").iterdir()) == [
-        "000003", "000006", "last",
-    ]  # fmt: skip
+        "000003",
+        "000006",
+        "last",
+    ]
 
 
 @pytest.mark.parametrize("model", SIZES)
@@ -138,9 +159,12 @@ def test_a_run_goes_on_with_as_many_processes_as_it_began_with(trained_by_two, s
     last = folder / "checkpoints" / "000006"
     last.rename(folder / "000006")
     again = parsed(
-        "action_world_model", Path(small_dataset.root), trained_models["frame_tokenizer"], folder,
+        "action_world_model",
+        Path(small_dataset.root),
+        trained_models["frame_tokenizer"],
+        folder,
         BATCH // PROCESSES,
-    )  # fmt: skip
+    )
     with pytest.raises(FieldError, match=r"began with 2 processes, here are 1; .*--nproc_per_node=2"):
         train_world_model(again)
     (folder / "000006").rename(last)

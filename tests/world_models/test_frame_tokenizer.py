@@ -130,19 +130,25 @@ def test_fsq_learns_and_reconstructs_as_it_did_before_there_was_a_choice_of_quan
     assert tokens.tolist() == [60, 51, 51, 53, 60, 51, 68, 60, 68, 59, 67, 67, 60, 51, 51, 59]
 
 
-@pytest.mark.parametrize(("settings", "message"), [
-    ({"image_size": 30}, r"^tokenizer\.image_size=30: must be a multiple of 8"),
-    ({"widths": (16, 36)}, r"^tokenizer\.widths=\[16, 36\]: .*the last a multiple of 8"),
-    ({"widths": ()}, r"^tokenizer\.widths=\[\]"),
-    ({"levels": (5, 2)}, r"^tokenizer\.levels=\[5, 2\]: .*each of 3 or more"),
-    ({"quantizer": "lfq", "levels": (1, 1)}, r"^tokenizer\.levels=\[1, 1\]: .*each of 2 or more"),
-    ({"levels": (8, 8, 8, 8, 8, 8, 8)}, r"^tokenizer\.levels=.*2,097,152 codes are more than 1,048,576"),
-    ({"levels": (2**16, 2**16), "quantizer": "lfq"}, r"^tokenizer\.levels=.*more than 2,147,483,648"),
-    ({"quantizer": "lfq"}, r"^tokenizer\.levels=\[5, 5\]: with `tokenizer\.quantizer`=lfq .*power of two"),
-    ({"quantizer": "lfq", "levels": (8, 4)}, r"^tokenizer\.levels=\[8, 4\]: .*the same power"),
-    ({"quantizer": "lfq", "levels": (2**13,)}, r"^tokenizer\.levels=\[8192\]: .*at most 4096"),
-    ({"quantizer": "vq"}, r"^tokenizer\.quantizer=vq: choose one of fsq, lfq"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"image_size": 30}, r"^tokenizer\.image_size=30: must be a multiple of 8"),
+        ({"widths": (16, 36)}, r"^tokenizer\.widths=\[16, 36\]: .*the last a multiple of 8"),
+        ({"widths": ()}, r"^tokenizer\.widths=\[\]"),
+        ({"levels": (5, 2)}, r"^tokenizer\.levels=\[5, 2\]: .*each of 3 or more"),
+        ({"quantizer": "lfq", "levels": (1, 1)}, r"^tokenizer\.levels=\[1, 1\]: .*each of 2 or more"),
+        ({"levels": (8, 8, 8, 8, 8, 8, 8)}, r"^tokenizer\.levels=.*2,097,152 codes are more than 1,048,576"),
+        ({"levels": (2**16, 2**16), "quantizer": "lfq"}, r"^tokenizer\.levels=.*more than 2,147,483,648"),
+        (
+            {"quantizer": "lfq"},
+            r"^tokenizer\.levels=\[5, 5\]: with `tokenizer\.quantizer`=lfq .*power of two",
+        ),
+        ({"quantizer": "lfq", "levels": (8, 4)}, r"^tokenizer\.levels=\[8, 4\]: .*the same power"),
+        ({"quantizer": "lfq", "levels": (2**13,)}, r"^tokenizer\.levels=\[8192\]: .*at most 4096"),
+        ({"quantizer": "vq"}, r"^tokenizer\.quantizer=vq: choose one of fsq, lfq"),
+    ],
+)
 def test_impossible_settings_are_named(settings, message):
     with pytest.raises(FieldError, match=message):
         TokenizerConfig(**{"image_size": 32, "widths": (16, 32), "levels": (5, 5), **settings})

@@ -31,8 +31,11 @@ GOLDEN = {
     "text_world_model": [3.4957, 3.2739, 3.2533, 3.2365, 3.2799, 3.2537, 3.1759, 3.1622],
 }
 WORLD_MODEL: dict[str, Any] = {
-    "device": "cpu", "tokenizer": small_tokenizer(), "clip_length": CLIP_LENGTH, **SIZES,
-}  # fmt: skip
+    "device": "cpu",
+    "tokenizer": small_tokenizer(),
+    "clip_length": CLIP_LENGTH,
+    **SIZES,
+}
 AUTOREGRESSIVE = {"dynamics": "autoregressive", "window": 24}
 CROSS_ATTENTION = {**AUTOREGRESSIVE, "conditioning": "cross_attention"}
 

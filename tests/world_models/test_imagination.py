@@ -16,9 +16,15 @@ from lerobot_wmrl.world_models.modeling_world_model import (
 from tests.trained import nested, small_tokenizer
 
 SIZES: dict[str, Any] = {
-    "device": "cpu", "dynamics": "autoregressive", "tokenizer": small_tokenizer(),
-    "layers": 2, "width": 32, "heads": 2, "window": 4, "code_width": 8,
-}  # fmt: skip
+    "device": "cpu",
+    "dynamics": "autoregressive",
+    "tokenizer": small_tokenizer(),
+    "layers": 2,
+    "width": 32,
+    "heads": 2,
+    "window": 4,
+    "code_width": 8,
+}
 BATCH, TOKENS, CODES = 3, 16, 20
 
 

@@ -102,15 +102,18 @@ def test_the_classifier_learns_success_that_depends_on_the_instruction(reads):
     assert right > 0.95 if reads else right < 0.7
 
 
-@pytest.mark.parametrize(("instructions", "tasks", "count"), [
-    (["push"] * 10 + ["pull"] * 10, [-1] * 20, 2),
-    (["push"] * 10 + ["pull"] * 9 + ["pull it"], [-1] * 20, 3),
-    ([f"push cube {number // 3}" for number in range(20)], [-1] * 20, 1),
-    ([f"push cube {number // 3}" for number in range(20)], [0] * 19 + [2], 2),
-    (["push"] * 10 + ["pull"] * 10, [0] * 20, 1),
-    (["push"] * 10 + ["pull"] * 10, [0] * 10 + [-1] * 10, 2),
-    (["push"] * 20, [-1] * 20, 1),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("instructions", "tasks", "count"),
+    [
+        (["push"] * 10 + ["pull"] * 10, [-1] * 20, 2),
+        (["push"] * 10 + ["pull"] * 9 + ["pull it"], [-1] * 20, 3),
+        ([f"push cube {number // 3}" for number in range(20)], [-1] * 20, 1),
+        ([f"push cube {number // 3}" for number in range(20)], [0] * 19 + [2], 2),
+        (["push"] * 10 + ["pull"] * 10, [0] * 20, 1),
+        (["push"] * 10 + ["pull"] * 10, [0] * 10 + [-1] * 10, 2),
+        (["push"] * 20, [-1] * 20, 1),
+    ],
+)
 def test_tasks_are_told_by_their_column_or_by_instructions_that_are_repeated(instructions, tasks, count):
     """In one dataset, or in two."""
 
@@ -254,9 +257,15 @@ def test_the_loss_of_done_is_measured_by_the_instruction(model, two_tasks):
 def test_the_planner_needs_the_instruction(trained, two_tasks):
     kind = get_policy_class("wm_mpc")
     config = kind.config_class(
-        world_model_path=str(trained), horizon=4, execute=2, knots=2, samples=4, elites=2, iterations=1,
+        world_model_path=str(trained),
+        horizon=4,
+        execute=2,
+        knots=2,
+        samples=4,
+        elites=2,
+        iterations=1,
         device="cpu",
-    )  # fmt: skip
+    )
     policy = kind(config)
     row = two_tasks[0]
     batch = {key: row[key][None] for key in ("observation.images.third_view", "observation.state")}
@@ -326,9 +335,12 @@ def test_an_evaluation_names_it_before_it_replays(
     text = Checkpoint(str(trained_models["text_world_model"]))
     for path, text_model in ((trained, Checkpoint()), (trained_models["action_world_model"], text)):
         config = eval_world_model.EvalWorldModelConfig(
-            model=Checkpoint(str(path)), text_model=text_model, output_dir=tmp_path / path.name,
-            dataset=ChosenEpisodes(str(root)), device="cpu",
-        )  # fmt: skip
+            model=Checkpoint(str(path)),
+            text_model=text_model,
+            output_dir=tmp_path / path.name,
+            dataset=ChosenEpisodes(str(root)),
+            device="cpu",
+        )
         with pytest.raises(FieldError, match=r"dataset\.root=.*odd: task="):
             eval_world_model.eval_world_model(config)
         config.dataset.episodes = [0]

@@ -22,9 +22,13 @@ from lerobot_wmrl.world_models.processor_world_model import make_pass_through_pr
 
 SIZE, ACTIONS, LENGTHS = 32, 3, (9, 14, 2)
 LAST = Path("checkpoints") / "last" / "pretrained_model"
-SMALL = ["--reward_model.dynamics.layers=1", "--reward_model.dynamics.width=32",
-         "--reward_model.dynamics.heads=2", "--reward_model.dynamics.code_width=8",
-         "--reward_model.clip_length=6"]  # fmt: skip
+SMALL = [
+    "--reward_model.dynamics.layers=1",
+    "--reward_model.dynamics.width=32",
+    "--reward_model.dynamics.heads=2",
+    "--reward_model.dynamics.code_width=8",
+    "--reward_model.clip_length=6",
+]
 
 
 @pytest.fixture(scope="module")
@@ -34,18 +38,23 @@ def foreign_dataset(tmp_path_factory) -> Path:
     last = {"dtype": "image", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"]}
     action = {"dtype": "float32", "shape": (ACTIONS,), "names": None}
     features: dict[str, Any] = {
-        "observation.images.top": last, "observation.images.left.fisheye": first, "action": action,
-    }  # fmt: skip
+        "observation.images.top": last,
+        "observation.images.left.fisheye": first,
+        "action": action,
+    }
     root, rng = tmp_path_factory.mktemp("foreign") / "dataset", np.random.default_rng(0)
     dataset = LeRobotDataset.create("somebody/foreign", 10, features, root=root, use_videos=False)
     for length in LENGTHS:
         for _ in range(length):
             picture = rng.integers(0, 255, (SIZE, SIZE, 3), dtype=np.uint8)
-            dataset.add_frame({
-                "observation.images.top": picture,
-                "observation.images.left.fisheye": picture.transpose(2, 0, 1),
-                "action": rng.normal(size=ACTIONS).astype(np.float32), "task": "stir",
-            })  # fmt: skip
+            dataset.add_frame(
+                {
+                    "observation.images.top": picture,
+                    "observation.images.left.fisheye": picture.transpose(2, 0, 1),
+                    "action": rng.normal(size=ACTIONS).astype(np.float32),
+                    "task": "stir",
+                }
+            )
         dataset.save_episode()
     dataset.finalize()
     return root
@@ -68,11 +77,15 @@ def on(root: Path, steps: int) -> list[str]:
 def foreign_tokenizer(foreign_dataset, tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         return lerobot_trained(
-            patch, tmp_path_factory.mktemp("tokenizer") / "run", *on(foreign_dataset, 2),
-            "--reward_model.type=frame_tokenizer", f"--reward_model.tokenizer.image_size={SIZE}",
-            "--reward_model.tokenizer.cameras=[top,left.fisheye]", "--reward_model.tokenizer.widths=[8,16]",
+            patch,
+            tmp_path_factory.mktemp("tokenizer") / "run",
+            *on(foreign_dataset, 2),
+            "--reward_model.type=frame_tokenizer",
+            f"--reward_model.tokenizer.image_size={SIZE}",
+            "--reward_model.tokenizer.cameras=[top,left.fisheye]",
+            "--reward_model.tokenizer.widths=[8,16]",
             "--reward_model.tokenizer.levels=[5,4]",
-        )  # fmt: skip
+        )
 
 
 def test_a_world_model_of_any_dataset_goes_on_bit_for_bit(
@@ -80,9 +93,12 @@ def test_a_world_model_of_any_dataset_goes_on_bit_for_bit(
 ):
     """As `lerobot-train --resume=true` continues it: with its samples, but not with its random numbers."""
     monkeypatch.setattr(losses, "TOKEN_NOISE", 0.0)
-    flags = ["--reward_model.type=action_world_model", f"--reward_model.tokenizer_path={foreign_tokenizer}",
-             "--reward_model.dynamics.type=autoregressive",
-             "--reward_model.dynamics.self_forcing=0"]  # fmt: skip
+    flags = [
+        "--reward_model.type=action_world_model",
+        f"--reward_model.tokenizer_path={foreign_tokenizer}",
+        "--reward_model.dynamics.type=autoregressive",
+        "--reward_model.dynamics.self_forcing=0",
+    ]
     whole = lerobot_trained(monkeypatch, tmp_path / "run", *on(foreign_dataset, 4), *flags, *SMALL)
     expected = load_file(whole / LAST / "model.safetensors")
     (whole / "checkpoints" / "000004").rename(tmp_path / "lost")
@@ -106,8 +122,11 @@ def test_a_world_model_of_any_dataset_goes_on_bit_for_bit(
 def test_a_text_world_model_of_a_dataset_with_videos_states_and_labels(
     small_dataset, trained_models, monkeypatch, tmp_path
 ):
-    model = ["--reward_model.type=text_world_model", "--reward_model.goal_horizon=3",
-             f"--reward_model.tokenizer_path={trained_models['frame_tokenizer']}"]  # fmt: skip
+    model = [
+        "--reward_model.type=text_world_model",
+        "--reward_model.goal_horizon=3",
+        f"--reward_model.tokenizer_path={trained_models['frame_tokenizer']}",
+    ]
     folder = lerobot_trained(monkeypatch, tmp_path / "run", *on(Path(small_dataset.root), 2), *model, *SMALL)
     before = load_file(folder / "checkpoints" / "000002" / "pretrained_model" / "model.safetensors")
     assert all(torch.isfinite(value).all() for value in before.values())
@@ -118,10 +137,12 @@ def windows(length: int, padded: list[int]) -> dict[str, Any]:
     """Windows of which so many rows lie before their episode and repeat its first one, as LeRobot's do."""
     row = torch.stack([(torch.arange(length) - before).clamp(min=0) for before in padded]).float()
     return {
-        "action": row[..., None], "observation.state": row[..., None] + 100, "task": ["stir"] * len(padded),
+        "action": row[..., None],
+        "observation.state": row[..., None] + 100,
+        "task": ["stir"] * len(padded),
         "next.done": torch.tensor([True, False, True]),
         "camera_is_pad": torch.stack([torch.arange(length) < before for before in padded]),
-    }  # fmt: skip
+    }
 
 
 def test_a_window_that_begins_before_its_episode_becomes_a_clip_from_its_start():
@@ -151,10 +172,14 @@ def test_only_windows_that_hold_their_episodes_start_have_a_done_label_and_it_is
     assert not unlabelled.done_known.any()
 
 
-@pytest.mark.parametrize(("labels", "expected"), [
-    ({"next.done": [[True], [True]], "next.success": [[False], [True]]}, [[False], [True]]),
-    ({"next.done": [[True], [False]]}, [[True], [False]]), ({}, False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("labels", "expected"),
+    [
+        ({"next.done": [[True], [True]], "next.success": [[False], [True]]}, [[False], [True]]),
+        ({"next.done": [[True], [False]]}, [[True], [False]]),
+        ({}, False),
+    ],
+)
 def test_done_is_success_where_a_dataset_tells_them_apart(labels, expected):
     preprocess, _ = make_pass_through_processors(ActionWorldModelConfig(device="cpu"))
     batch = {name: torch.tensor(values) for name, values in labels.items()}
@@ -166,9 +191,12 @@ def test_vectors_of_one_component_are_vectors(tmp_path):
     """LeRobot stores them as scalars."""
     one = {"dtype": "float32", "shape": (1,), "names": None}
     dataset = LeRobotDataset.create(
-        "somebody/slider", 10, {"action": one, "observation.state": one}, root=tmp_path / "dataset",
+        "somebody/slider",
+        10,
+        {"action": one, "observation.state": one},
+        root=tmp_path / "dataset",
         use_videos=False,
-    )  # fmt: skip
+    )
     for row in np.arange(4, dtype=np.float32):
         dataset.add_frame({"action": row[None], "observation.state": row[None] + 100, "task": "slide"})
     dataset.save_episode()

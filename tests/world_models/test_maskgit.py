@@ -23,9 +23,15 @@ LEVELS, TOKENS, WIDTH, FRAMES = (5, 3), 4, 32, 4
 
 def config(passes: int = 0) -> AutoregressiveConfig:
     return AutoregressiveConfig(
-        layers=1, width=WIDTH, heads=2, patch=1, code_width=16, window=FRAMES,
-        conditioning="cross_attention", maskgit_steps=passes,
-    )  # fmt: skip
+        layers=1,
+        width=WIDTH,
+        heads=2,
+        patch=1,
+        code_width=16,
+        window=FRAMES,
+        conditioning="cross_attention",
+        maskgit_steps=passes,
+    )
 
 
 def network() -> NextFrameNetwork:

@@ -38,8 +38,10 @@ def test_a_published_model_is_the_trained_one(name, hub, small_dataset, trained_
     torch.manual_seed(0)
     batch = {
         **{f"{part}.third_view": torch.rand(2, 3, 32, 32) for part in ("observation.images", "goal")},
-        "observation.state": torch.randn(2, 4, 8), "action": torch.randn(2, 4, 7), "task": ["push", "pull"],
-    }  # fmt: skip
+        "observation.state": torch.randn(2, 4, 8),
+        "action": torch.randn(2, 4, 7),
+        "task": ["push", "pull"],
+    }
     if name != "frame_tokenizer":
         batch["observation.images.third_view"] = torch.rand(2, 4, 3, 32, 32)
     expected = load_model(folder, name).compute_reward(batch)
@@ -91,9 +93,13 @@ def test_an_evaluation_is_put_on_the_card_and_replaced_by_the_next(
     weights, card = repo.head["model.safetensors"], repo.head["README.md"].decode()
     for run, split in enumerate(["all", "train"]):
         evaluation = EvalWorldModelConfig(
-            model=Checkpoint("somebody/world_model"), dataset=ChosenEpisodes(root=str(small_dataset.root)),
-            split=split, push_to_hub=True, output_dir=tmp_path / f"check{run}", device="cpu",
-        )  # fmt: skip
+            model=Checkpoint("somebody/world_model"),
+            dataset=ChosenEpisodes(root=str(small_dataset.root)),
+            split=split,
+            push_to_hub=True,
+            output_dir=tmp_path / f"check{run}",
+            device="cpu",
+        )
         eval_world_model(evaluation)
         found = repo.head["README.md"].decode()
         assert found.startswith(card.rstrip())
@@ -147,9 +153,11 @@ def test_a_hub_that_is_gone_after_the_training_is_named(hub, small_dataset, tmp_
 def test_an_evaluation_without_a_login_is_not_begun(hub, small_dataset, tmp_path, monkeypatch):
     monkeypatch.setattr("lerobot_wmrl.common.hub.get_token", lambda: None)
     evaluation = EvalWorldModelConfig(
-        model=Checkpoint("somebody/world_model"), dataset=ChosenEpisodes(root=str(small_dataset.root)),
-        push_to_hub=True, output_dir=tmp_path / "check",
-    )  # fmt: skip
+        model=Checkpoint("somebody/world_model"),
+        dataset=ChosenEpisodes(root=str(small_dataset.root)),
+        push_to_hub=True,
+        output_dir=tmp_path / "check",
+    )
     with pytest.raises(FieldError, match=r"^push_to_hub=true: nobody is logged in"):
         eval_world_model(evaluation)
     assert not (tmp_path / "check").exists()
@@ -157,9 +165,11 @@ def test_an_evaluation_without_a_login_is_not_begun(hub, small_dataset, tmp_path
 
 def test_an_evaluation_of_a_folder_is_not_published(trained_models, small_dataset, tmp_path):
     evaluation = EvalWorldModelConfig(
-        model=Checkpoint(str(trained_models["action_world_model"])), push_to_hub=True,
-        dataset=ChosenEpisodes(root=str(small_dataset.root)), output_dir=tmp_path / "check",
-    )  # fmt: skip
+        model=Checkpoint(str(trained_models["action_world_model"])),
+        push_to_hub=True,
+        dataset=ChosenEpisodes(root=str(small_dataset.root)),
+        output_dir=tmp_path / "check",
+    )
     with pytest.raises(FieldError, match=r"^push_to_hub=True: .* is a folder here; publish it by"):
         eval_world_model(evaluation)
     assert not (tmp_path / "check").exists()

@@ -250,8 +250,10 @@ def test_lerobots_windows_have_features_too(models, small_dataset):
     window = model.config.clip_length
     images = frames_to_tensor(cached_frames(small_dataset, [CAMERA], 32)[:window])[None, :, 0]
     batch = {
-        CAMERA: images, "action": torch.zeros(1, window, 7), "observation.state": torch.zeros(1, window, 8),
-    }  # fmt: skip
+        CAMERA: images,
+        "action": torch.zeros(1, window, 7),
+        "observation.state": torch.zeros(1, window, 8),
+    }
     clip = model.clip_from_batch(batch)
     expected = model.tokenizer.success_features(images[:, :1], images[:, 3:4])
     torch.testing.assert_close(clip.features[:, 3], expected, atol=1e-5, rtol=1e-5)
@@ -275,7 +277,12 @@ def test_a_dataset_without_labels_is_refused_also_as_a_further_one(small_dataset
     with pytest.raises(FieldError, match=r"tokenizer\.success=True.*unlabelled has neither next\.success"):
         train_world_model(
             TrainWorldModelConfig(
-                model=config, dataset=TrainingData(str(root), more=[str(unlabelled)]),
-                output_dir=tmp_path / "beside", steps=1, batch_size=2, save_freq=1, log_freq=1,
+                model=config,
+                dataset=TrainingData(str(root), more=[str(unlabelled)]),
+                output_dir=tmp_path / "beside",
+                steps=1,
+                batch_size=2,
+                save_freq=1,
+                log_freq=1,
             )
-        )  # fmt: skip
+        )

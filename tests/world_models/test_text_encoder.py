@@ -85,9 +85,13 @@ def test_a_pretrained_tokenizers_own_maximum_counts(tmp_path):
         t5.embed(SHORT, torch.device("cpu"))
 
 
-@pytest.mark.parametrize(("given", "message"), [
-    (["push", "pull"], "2 instructions for 3 episodes"), ("push", "a single string for 3 episodes"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["push", "pull"], "2 instructions for 3 episodes"),
+        ("push", "a single string for 3 episodes"),
+    ],
+)
 def test_an_instruction_is_needed_for_each_episode(given, message):
     with pytest.raises(ValueError, match=f"task: {message}; give a list with one instruction for each"):
         check_one_each(given, 3)
@@ -107,8 +111,11 @@ def test_a_frozen_t5_gives_what_transformers_gives_and_computes_it_once(tmp_path
 def test_a_frozen_t5_is_no_part_of_the_models_parameters(tmp_path):
     encoder = FrozenTextEncoder(WIDTH, FrozenT5.load(str(save_t5(tmp_path)))).train()
     assert {name for name, _ in encoder.named_parameters()} == {
-        "norm.weight", "norm.bias", "project.weight", "project.bias",
-    }  # fmt: skip
+        "norm.weight",
+        "norm.bias",
+        "project.weight",
+        "project.bias",
+    }
     assert encoder.state_dict().keys() == dict(encoder.named_parameters()).keys()
     assert not encoder.t5.model.training
     encoder([SHORT])[0].sum().backward()

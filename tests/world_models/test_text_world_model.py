@@ -116,14 +116,18 @@ def test_it_loads_from_the_hub_by_its_id(trained, tmp_path, monkeypatch):
         api = HfApi(hub.url, WRITE_TOKEN)
         api.create_repo("somebody/golden")
         api.upload_folder(
-            repo_id="somebody/golden", folder_path=model_folder(trained),
+            repo_id="somebody/golden",
+            folder_path=model_folder(trained),
             allow_patterns=[f"*{suffix}" for suffix in LEROBOT_PUBLISHES],
-        )  # fmt: skip
+        )
         own = {"HF_ENDPOINT": hub.url, "HF_HOME": str(tmp_path), "HF_HUB_DISABLE_XET": "1"}
         done = subprocess.run(
-            [sys.executable, "-c", LOAD, *INSTRUCTIONS], env={**os.environ, **own}, capture_output=True,
-            text=True, timeout=120,
-        )  # fmt: skip
+            [sys.executable, "-c", LOAD, *INSTRUCTIONS],
+            env={**os.environ, **own},
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
     assert done.returncode == 0, done.stderr
     condition = model.encode_instructions(INSTRUCTIONS, 2)[0]
     assert json.loads(done.stdout.splitlines()[-1]) == pytest.approx(condition.flatten().tolist(), abs=1e-5)

@@ -13,7 +13,8 @@ from safetensors.torch import load_file
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.constants import KINDS, START_KIND
-from lerobot_wmrl.common.presets import PRESETS, preset_flags
+from lerobot_wmrl.common.flags import format_flags
+from lerobot_wmrl.common.presets import PRESETS, preset_settings
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.clips import ClipSampler, InTurn
 from lerobot_wmrl.data.dataset import ChosenEpisodes, TrainingData, open_dataset
@@ -83,11 +84,16 @@ def test_training_meets_every_length_of_history(sampler):
 def test_the_flags_of_a_preset_fit_together(preset):
     """Lookup-free codes from `gpu` on; and the network's patches divide the tokenizer's grid."""
     tokenizer, *world_models = (
-        parse(TrainWorldModelConfig, args=[
-            *preset_flags(preset, "train-world-model", [kind]), f"--model.type={kind}", "--model.device=cpu",
-        ]).model
+        parse(
+            TrainWorldModelConfig,
+            args=[
+                *format_flags(preset_settings(preset, "train-world-model", [kind])),
+                f"--model.type={kind}",
+                "--model.device=cpu",
+            ],
+        ).model
         for kind in ("frame_tokenizer", "action_world_model", "text_world_model")
-    )  # fmt: skip
+    )
     assert tokenizer.tokenizer.quantizer == ("lfq" if preset in ("gpu", "paper") else "fsq")
     grid = make_reward_model(tokenizer).tokenizer.grid
     assert all(grid % config.dynamics.patch == 0 for config in world_models)
@@ -205,16 +211,29 @@ def test_only_successful_optimal_episodes_are_golden(small_dataset):
     kinds = table.columns[START_KIND].copy()
     kinds[[0, 1, 3]] = [KINDS.index(kind) for kind in ("policy", "near_miss", "human_like")]
     assert golden_episodes(replace(table, columns={START_KIND: kinds})).tolist() == [
-        False, False, False, True, True, False,
-    ]  # fmt: skip
+        False,
+        False,
+        False,
+        True,
+        True,
+        False,
+    ]
     assert golden_episodes(replace(table, columns={})).tolist() == [True, True, False] * 2
 
 
-@pytest.mark.parametrize(("build", "precision"), [
-    (action_config, "float32"), (action_config, "bfloat16"), (text_config, "float32"),
-    (lambda _: tokenizer_config(), "bfloat16"),
-    (partial(action_config, dynamics="autoregressive", self_rollout=1.0, keypoint_weight=1.0), "bfloat16"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("build", "precision"),
+    [
+        (action_config, "float32"),
+        (action_config, "bfloat16"),
+        (text_config, "float32"),
+        (lambda _: tokenizer_config(), "bfloat16"),
+        (
+            partial(action_config, dynamics="autoregressive", self_rollout=1.0, keypoint_weight=1.0),
+            "bfloat16",
+        ),
+    ],
+)
 def test_training_goes_on_bit_for_bit_after_a_stop(build, precision, small_dataset, trained_models, tmp_path):
     """With its samples, optimiser and random numbers; and the checkpoint tells the precision."""
     tokenizer, root = trained_models["frame_tokenizer"], Path(small_dataset.root)
@@ -278,8 +297,10 @@ def test_checkpoints_are_self_contained_and_in_lerobots_layout(trained_models):
     for name, folder in trained_models.items():
         last = folder / "checkpoints" / "last" / "pretrained_model"
         assert {path.name for path in last.iterdir()} == {
-            "config.json", "model.safetensors", "train_config.json",
-        }  # fmt: skip
+            "config.json",
+            "model.safetensors",
+            "train_config.json",
+        }
         assert RewardModelConfig.from_pretrained(str(last)).type == name
         assert json.loads((last / "config.json").read_text()).get("tokenizer_path") is None
 
@@ -291,10 +312,12 @@ def test_a_world_model_does_without_proprioception(small_dataset, trained_models
     text = run_training(text_config(tokenizer, state_size=0), root, tmp_path / "text")
     eval_world_model(
         EvalWorldModelConfig(
-            model=Checkpoint(str(action)), text_model=Checkpoint(str(text)),
-            dataset=ChosenEpisodes(str(root)), output_dir=tmp_path / "replay",
+            model=Checkpoint(str(action)),
+            text_model=Checkpoint(str(text)),
+            dataset=ChosenEpisodes(str(root)),
+            output_dir=tmp_path / "replay",
         )
-    )  # fmt: skip
+    )
     assert "tcp_error_mm_by_step" not in json.loads((tmp_path / "replay" / "metrics.json").read_text())
     config = WorldModelEnv(
         world_model_path=str(action), text_world_model_path=str(text), dataset=StartFrames(str(root))

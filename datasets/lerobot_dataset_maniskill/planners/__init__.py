@@ -16,8 +16,11 @@ from lerobot_wmrl.maniskill.tasks import Start
 __all__ = ["MOTIONS", "PLANNERS", "TASK_KINDS", "Follower", "Motion", "Plan", "TaskPlanner", "follow_plan"]
 
 PLANNERS: Final[dict[str, type[TaskPlanner]]] = {
-    "push": PushPlanner, "pull": PullPlanner, "pick_place": PickPlacePlanner, "move_to_aim": MoveToAimPlanner,
-}  # fmt: skip
+    "push": PushPlanner,
+    "pull": PullPlanner,
+    "pick_place": PickPlacePlanner,
+    "move_to_aim": MoveToAimPlanner,
+}
 """Task → planner."""
 
 

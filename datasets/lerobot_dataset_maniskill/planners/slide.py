@@ -128,5 +128,10 @@ def slide_diagonally(slide: SlidePlanner, rng: np.random.Generator) -> Waypoints
 
 NearMiss = Callable[[SlidePlanner, np.random.Generator], Waypoints]
 NEAR_MISSES: Final[tuple[NearMiss, ...]] = (
-    pass_over, stop_short, slide_partly, slide_diagonally, *3 * (pass_beside,), *3 * (slide_off_centre,),
-)  # fmt: skip
+    pass_over,
+    stop_short,
+    slide_partly,
+    slide_diagonally,
+    *3 * (pass_beside,),
+    *3 * (slide_off_centre,),
+)

@@ -31,6 +31,7 @@ from lerobot_wmrl.improve.report.words import (
 )
 from lerobot_wmrl.improve.results import Place, read_check, read_gate, read_selection
 from lerobot_wmrl.improve.stage_names import StageName
+from lerobot_wmrl.improve.stages import list_stages
 
 PAGE = "report.html"
 
@@ -90,10 +91,13 @@ class Page:
         """Return the page of an improvement by itself."""
         plan = progress.plan
         return cls(
-            progress, f"{plan.policy}, improved in imagination", plan.config.seed,
-            stage_records(plan.out, commands.stages(progress)), [compared(progress)],
+            progress,
+            f"{plan.policy}, improved in imagination",
+            plan.config.seed,
+            stage_records(plan.out, list_stages(progress)),
+            [compared(progress)],
             {"recorded": plan.folder(StageName.CHECK)},
-        )  # fmt: skip
+        )
 
     def write(self, folder: Path) -> Path:
         """Write summary.json and the page into a folder; return the page."""
@@ -126,7 +130,7 @@ class Page:
         for record in self.records:
             records.append(record)
             if shlex.split(record["command"])[0] == "lerobot-wmrl-improve":
-                nested = stage_records(self.progress.plan.out, commands.stages(self.progress))
+                nested = stage_records(self.progress.plan.out, list_stages(self.progress))
                 records += [{**each, "title": f"– {each['title']}"} for each in nested]
         return records
 

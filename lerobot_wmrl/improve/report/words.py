@@ -69,10 +69,16 @@ def verdict(progress: Progress, places: Sequence[Place]) -> str:
         rates = [f"- {title}: {rate}, `{paths[title]}`" for title, rate in place.rates.items()]
         changes = [f"- {line}" for line in pair_lines(place, chosen)]
         paragraphs.append("\n".join([f"Success {place.name}, on the same starts:", *rates, *changes]))
-    return "\n\n".join([
-        *paragraphs, decided_at(places), f"The world model: {trust(progress)}", *lacks(progress),
-        *reservations(progress), choice_line(progress),
-    ])  # fmt: skip
+    return "\n\n".join(
+        [
+            *paragraphs,
+            decided_at(places),
+            f"The world model: {trust(progress)}",
+            *lacks(progress),
+            *reservations(progress),
+            choice_line(progress),
+        ]
+    )
 
 
 def choice_line(progress: Progress) -> str:

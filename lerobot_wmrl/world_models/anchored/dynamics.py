@@ -94,9 +94,13 @@ class AnchoredDynamics(Dynamics):
             assert imagination.scene is not None
             assert imagination.rollout is not None
             prediction, rollout = network.follow(
-                imagination.scene, imagination.rollout, condition.mean(), imagination.advance(), None,
+                imagination.scene,
+                imagination.rollout,
+                condition.mean(),
+                imagination.advance(),
+                None,
                 condition.instruction_weights,
-            )  # fmt: skip
+            )
             imagination.rollout = rollout.last()
             codes = network.codebook.most_likely(prediction.logits)
         return self._advance(imagination, prediction, codes)

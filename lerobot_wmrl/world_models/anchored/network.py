@@ -226,9 +226,14 @@ class AnchoredNetwork(FrameNetwork):
         self.scene_norm, self.norm, self.drawn_norm = (nn.LayerNorm(width) for _ in range(3))
 
     def forward(
-        self, codes: Tensor, state: Tensor, condition: Condition, length: int, steps: Tensor | None = None,
+        self,
+        codes: Tensor,
+        state: Tensor,
+        condition: Condition,
+        length: int,
+        steps: Tensor | None = None,
         context: Context = NO_CONTEXT,
-    ) -> Prediction:  # fmt: skip
+    ) -> Prediction:
         """Predict the frames after each of T = `length` steps at once, from the first frame.
 
         There may be J conditions for each first frame, one frame's after another's: the prediction is then of

@@ -133,9 +133,12 @@ class SpatialTemporalBlock(nn.Module):
         self.mlp = make_mlp(width)
 
     def forward(
-        self, x: Tensor, condition: Condition, mean: Tensor,
+        self,
+        x: Tensor,
+        condition: Condition,
+        mean: Tensor,
         attend_time: Callable[[Tensor, Tensor, Tensor], Tensor],
-    ) -> Tensor:  # fmt: skip
+    ) -> Tensor:
         """x (B, T, S, D) → same; `attend_time` maps query, key and value (B, S, h, T, d) to the attended."""
         space, time, mlp = self.condition.modulations(mean)
         heads = self.space.split_heads(space.input(self.space.norm(x)))
@@ -160,9 +163,13 @@ class SpatialTemporalTransformer(nn.Module):
         self.norm = nn.LayerNorm(width)
 
     def forward(
-        self, x: Tensor, condition: Condition, memory: TemporalMemory,
-        added: Sequence[Tensor] = (), fusion: Sequence[nn.Module] = (),
-    ) -> tuple[Tensor, list[Tensor]]:  # fmt: skip
+        self,
+        x: Tensor,
+        condition: Condition,
+        memory: TemporalMemory,
+        added: Sequence[Tensor] = (),
+        fusion: Sequence[nn.Module] = (),
+    ) -> tuple[Tensor, list[Tensor]]:
         """Run the blocks.
 
         Args:
@@ -199,9 +206,13 @@ class NextFrameNetwork(FrameNetwork):
         self.depth: DepthPredictor | None = None  # set by the dynamics, if configured
 
     def forward(
-        self, codes: Tensor, state: Tensor, condition: Condition, memory: TemporalMemory | None = None,
+        self,
+        codes: Tensor,
+        state: Tensor,
+        condition: Condition,
+        memory: TemporalMemory | None = None,
         depth: Tensor | None = None,
-    ) -> tuple[Prediction, Tensor]:  # fmt: skip
+    ) -> tuple[Prediction, Tensor]:
         """Predict the frame after each of T frames.
 
         Args:
