@@ -10,8 +10,9 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from torch import Tensor
 
 from lerobot_wmrl.common.cuda_graphs import cuda_graphs
+from lerobot_wmrl.common.flags import format_flags
 from lerobot_wmrl.common.precision import compute_in
-from lerobot_wmrl.common.presets import preset_flags
+from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.data.frames import Context, Frames
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
@@ -161,7 +162,7 @@ def random_clip(model: WorldModelRewardModel, batch: int, device: torch.device) 
 
 def preset_config(preset: str, kind: str, flags: Sequence[str] = ()) -> TrainWorldModelConfig:
     """The configuration that the training command has with `--preset` and `flags`."""
-    sizes = preset_flags(preset, "train-world-model", [kind])
+    sizes = format_flags(preset_settings(preset, "train-world-model", [kind]))
     return draccus.parse(
         TrainWorldModelConfig, args=[*sizes, f"--model.type={kind}", "--model.device=cpu", *flags]
     )

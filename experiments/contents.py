@@ -91,9 +91,6 @@ CHAPTERS: Final[Mapping[str, Mapping[str, Section]]] = {
         "value_tasks_simulator": Section(
             "Pull, move to aim: PPO in ManiSkill", partial(TASKS_ROWS, ["simulated_ppo"])
         ),
-        "value_tasks_ppo_distilled": Section(
-            "Pull, move to aim: distillation after PPO", partial(TASKS_ROWS, ["ppo_distilled"])
-        ),
         "value_four_tasks": Section("One policy for four tasks", four_tasks_section.section),
         "value_four_tasks_simulator": Section(
             "One policy for four tasks: PPO in ManiSkill",

@@ -84,7 +84,7 @@ SECOND_PARTS: Final = (
 """The same of the second task."""
 
 TASKS_STUDY: Final = "value_tasks"
-TASKS_PARTS: Final = ("value_tasks_simulator", "value_tasks_ppo_distilled")
+TASKS_PARTS: Final = ("value_tasks_simulator",)
 TASKS_GROUPS: Final = ("task", *REAL_EPISODES)
 """The same of further tasks, and what their cells are grouped by."""
 

@@ -326,10 +326,13 @@ def beyond_seeds(found: Groups) -> str:
             each = gains(cells, *best_pair(cells, domain), domain)
             compared += len(each) > 2
             if len(each) > 2 and (low := ttest_1samp(each, 0).confidence_interval().low) > 0:
-                certain.append(f"{spoken(group)}, {DOMAINS[domain]} scenes (from {100 * low:.0f} on)")
-    said = f"a gain is above 0 with {listed(certain)}" if certain else "no gain is clearly above 0"
+                certain.append(
+                    f"{spoken(group)}, {DOMAINS[domain]} scenes (lower end {100 * low:.0f} points)"
+                )
+    which = f": {listed(certain)}" if certain else ""
     return f"""These intervals draw starts and seeds, and with three seeds they are too narrow. By Student's t
-over the gains of three seeds alone, {said} ({compared} gains; their number is not corrected for)."""
+over the gains of three seeds alone, the 95 % interval of {len(certain)} of {compared} gains
+excludes 0{which}. This is not corrected for their number."""
 
 
 def rows_above(methods: Sequence[str], load: Load, study: str = STUDY, parts: Sequence[str] = PARTS) -> str:

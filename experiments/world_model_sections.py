@@ -229,8 +229,8 @@ AdaLN in seed 1; *maskgit* and *self rollout* have cross-attention. All are far 
 
 
 def learning_curve(load: Load) -> str:
-    return f"""All three, longer training most: half of the steps loses 3.5 dB of delta-PSNR. Frames are
-predicted well early and from few episodes; predicting success takes more data, steps and parameters.
+    return f"""More training: half of the steps loses 3.5 dB of delta-PSNR. Half of the data or of the network
+loses little, within the intervals; predicting success (AUC) seems to need all three.
 
 {training_rows(load("learning_curve")["variants"])}
 

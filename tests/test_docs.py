@@ -3,8 +3,9 @@
 import json
 import re
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pytest
@@ -13,22 +14,23 @@ from scipy.stats import ttest_1samp
 from experiments.tables import loader
 from experiments.value_cells import (
     BASELINES,
-    IMAGINED,
+    SCENES,
     SECOND_PARTS,
     SECOND_STUDY,
+    Cell,
     best,
     gains,
     groups,
-    outcomes,
 )
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.statistics import RunsMean
 from lerobot_wmrl.common.stored_help import FOLDER
 from lerobot_wmrl.improve.progress import CLONED, DISTILLED, PPO, SFT
 from tests.experiments.typed import ROOT, check
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 WRITTEN = [page for page in PAGES if page.name != "results.md"]
+RESULTS: Final = ROOT / "docs" / "results"
+BC: Final = ("cloning", "longer", "filtered", "longer_filtered")
 NAMES = [str(page.relative_to(ROOT)) for page in WRITTEN]
 
 
@@ -106,181 +108,145 @@ def test_the_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text().split()) < 1000
 
 
-def best_success(cells: Sequence[dict[str, Any]], methods: Sequence[str], domain: str) -> int:
-    """Percent of the best method, the mean over seeds."""
-    method = best(cells, methods, domain)
-    return round(100 * RunsMean.over(outcomes(cells, method, domain)).mean)
+def in_percent(*shares: float) -> str:
+    return "/".join(f"{100 * share:.0f}" for share in shares)
 
 
-def known_and_unseen(cells: Sequence[dict[str, Any]], methods: Sequence[str]) -> str:
-    """Success as the README shows it; a dash where it was not measured with every seed."""
-    if not any(all(method in cell["methods"] for cell in cells) for method in methods):
-        return "–"
-    return "/".join(str(best_success(cells, methods, domain)) for domain in ("ind", "ood"))
+def read_all(study: str) -> list[Cell]:
+    """The published cells of a study, in order of their seeds."""
+    cells = [json.loads(path.read_text()) for path in (RESULTS / study).glob("*.json")]
+    return sorted(cells, key=lambda cell: cell["seed"])
 
 
-def in_points(cells: Sequence[dict[str, Any]], method: str, baseline: str) -> str:
+def mean_success(cells: Sequence[Cell], method: str) -> str:
+    """Known/unseen success as the README shows it, the mean over seeds."""
+    shares = ([cell["methods"][method][domain]["share"] for cell in cells] for domain in SCENES)
+    return in_percent(*map(np.mean, shares))
+
+
+def mean_over_tasks(cells: Sequence[Cell], method: str) -> str:
+    """The same of cells that have several tasks."""
+    tasks = [task for cell in cells for task in cell["tasks"].values()]
+    return in_percent(*(np.mean([task[domain][method]["share"] for task in tasks]) for domain in SCENES))
+
+
+def best_bc(cells: Sequence[Cell]) -> str:
+    """The method of BC with the most successes, chosen where it is reported; it was run with every seed."""
+    names = [name for name in BC if all(name in cell["methods"] for cell in cells)]
+    return max(names, key=lambda name: sum(cell["methods"][name][d]["k"] for cell in cells for d in SCENES))
+
+
+def seed_interval(cells: Sequence[Cell], method: str, baseline: str, domain: str) -> tuple[float, float]:
+    """95 % interval of what a method gains, by Student's t over the seeds."""
+    interval = ttest_1samp(gains(cells, method, baseline, domain), 0).confidence_interval()
+    return interval.low, interval.high
+
+
+def in_words(low: float, high: float) -> str:
+    return f"{100 * low:.0f} to {100 * high:.0f}"
+
+
+def in_points(cells: Sequence[Cell], method: str, baseline: str) -> str:
     """What a method gains in known scenes, seed by seed."""
     found = gains(cells, method, baseline, "ind")
     return ", ".join(f"{round(100 * each)}".replace("-", "−") for each in found)
 
 
-def test_the_readme_says_what_is_chance() -> None:
-    """Gains over the best baseline: by Student's t over the seeds, and of PPO alone."""
-    text, (first, *others) = (ROOT / "README.md").read_text(), groups(loader(ROOT / "docs")).values()
-    means, ends, alone = [], [], []
-    for domain in ("ind", "ood"):
-        over = gains(first, "ppo_distilled", best(first, BASELINES, domain), domain)
-        interval = ttest_1samp(over, 0).confidence_interval()
-        means.append(f"{100 * np.mean(over):.0f}")
-        ends.append(f"{100 * interval.low:.0f} to {100 * interval.high:.0f}".replace("-", "−"))
-        ppo = gains(first, "imagined_ppo", best(first, BASELINES, domain), domain)
-        alone.append(f"{100 * np.mean(ppo):.0f}")
-        assert ttest_1samp(ppo, 0).pvalue > 0.05
-    assert f"distilled +{'/+'.join(means)} ({'/'.join(ends)})" in text
-    assert f"PPO +{'/+'.join(alone)}, within chance" in text
-    best_gains, ppo_gains = [], []
-    for cells in others:
-        for domain in ("ind", "ood"):
-            baseline = best(cells, BASELINES, domain)
-            over = gains(cells, best(cells, IMAGINED, domain), baseline, domain)
-            assert ttest_1samp(over, 0).pvalue > 0.05
-            best_gains.append(round(100 * np.mean(over)))
-            ppo_gains.append(round(100 * np.mean(gains(cells, "imagined_ppo", baseline, domain))))
-    assert f"Our best methods gain {min(best_gains)} to {max(best_gains)}, within chance" in text
-    assert f"PPO alone gains {max(0, min(ppo_gains))} to {max(ppo_gains)}." in text
-
-
-def test_the_readme_compares_on_the_same_recordings() -> None:
-    text = (ROOT / "README.md").read_text()
-    cells = [json.loads(path.read_text()) for path in (ROOT / "docs/results/value_rewards").glob("*.json")]
-    assert len(cells) == 3
-    for method, words in (
-        ("longer_filtered", "longer BC {rates}, PPO"),
-        ("success", "PPO {rates} (+{gained}: Student's t over seeds, uncorrected)"),
-        ("distilled", "distilled {rates} (+{gained})."),
-    ):
-        shares = ([cell["methods"][method][domain]["share"] for cell in cells] for domain in ("ind", "ood"))
-        over = (
-            ttest_1samp(gains(cells, method, "longer_filtered", domain), 0).confidence_interval()
-            for domain in ("ind", "ood")
-        )
-        rates = "/".join(f"{100 * np.mean(each):.0f}" for each in shares)
-        gained = "/+".join(f"{100 * low:.0f} to {100 * high:.0f}" for low, high in over)
-        assert words.format(rates=rates, gained=gained) in text
-    cells.sort(key=lambda cell: cell["seed"])
-    over = [
-        [f"{100 * each:.0f}" for each in gains(cells, "distilled", "longer_filtered", domain)]
-        for domain in ("ind", "ood")
-    ]
-    known, unseen = (f"{', '.join(each[:-1])} and {each[-1]}" for each in over)
-    said = f"by seed {known} points more than BC in known scenes, {unseen} in unseen ones"
-    assert said in (ROOT / "docs" / "objections.md").read_text()
-    for said, demonstrations, rival in (
-        (
-            "25 ({seeds}): best BC {filtered}, PPO {imagined_ppo}, distilled {ppo_distilled}; 50",
-            25,
-            "filtered",
-        ),
-        ("50 ({seeds}): {cloning}, {imagined_ppo}, {ppo_distilled}.", 50, "cloning"),
-    ):
-        more = [
-            json.loads(path.read_text())["methods"]
-            for path in (ROOT / "docs/results/value_same_recordings").glob(f"*s{demonstrations}_*.json")
-        ]
-        seeds = {1: "one seed", 2: "two seeds", 3: "three seeds"}[len(more)]
-        rates = {
-            method: "/".join(
-                f"{100 * np.mean([cell[method][domain]['share'] for cell in more]):.0f}"
-                for domain in ("ind", "ood")
-            )
-            for method in more[0]
-        }
-        assert said.format(seeds=seeds, **rates) in text
-        baselines = {
-            name: sum(cell[name][domain]["k"] for cell in more for domain in ("ind", "ood"))
-            for name in more[0]
-            if name in BASELINES
-        }
-        assert max(baselines, key=baselines.__getitem__) == rival
-    (simulated,) = (ROOT / "docs/results/value_four_tasks_simulator").glob("*.json")
-    for path, method, words in (
-        (simulated, "simulated_ppo", "and {} after PPO in ManiSkill"),
-        (ROOT / "docs/results/value_four_tasks" / simulated.name, "imagined_ppo", "The first seed has {},"),
-    ):
-        tasks = json.loads(path.read_text())["tasks"].values()
-        shares = ([task[domain][method]["share"] for task in tasks] for domain in ("ind", "ood"))
-        assert words.format("/".join(f"{100 * np.mean(each):.0f}" for each in shares)) in text
-
-
-def test_the_readme_says_what_was_measured() -> None:
-    text, results = (ROOT / "README.md").read_text(), ROOT / "docs" / "results"
-    budgets = groups(loader(ROOT / "docs"))
+def push_rows() -> dict[str, tuple[list[Cell], tuple[str, str, str]]]:
+    """README's rows of push with the policy cnn: cells, and BC, PPO and the distilled planner in them."""
+    (more,) = (cells for budget, cells in groups(loader(ROOT / "docs")).items() if budget == (25, 1000))
     rows = {
-        "BC of the demonstrations": ("cloning",),
-        "best baseline": BASELINES,
-        "PPO in imagination": ("imagined_ppo",),
-        "PPO, then planning": ("planned",),
-        "PPO, then the planner distilled": ("ppo_distilled",),
+        "[8 + 300](docs/results.md#value_rewards)": (read_all("value_rewards"), ("success", "distilled")),
+        "[25 + 1,000](docs/results.md#value_push)": (more, ("imagined_ppo", "ppo_distilled")),
     }
-    for title, methods in rows.items():
-        shown = " | ".join(known_and_unseen(cells, methods) for cells in budgets.values())
-        assert f"| {title} | {shown} |" in text
-    places = json.loads((results / "demo.json").read_text())["runs"][0]["places"]
+    for demonstrations in (25, 50):
+        cells = [c for c in read_all("value_same_recordings") if c["demonstrations"] == demonstrations]
+        title = f"[{demonstrations} + 300](docs/results.md#value_same_recordings)"
+        rows[title] = cells, ("imagined_ppo", "ppo_distilled")
+    return {title: (cells, (best_bc(cells), *methods)) for title, (cells, methods) in rows.items()}
+
+
+def test_the_readme_s_table_says_what_was_measured() -> None:
+    text, simulated = (ROOT / "README.md").read_text(), groups(loader(ROOT / "docs"))
+    for title, (cells, (bc, *imagined)) in push_rows().items():
+        budget = cells[0]["demonstrations"], cells[0]["rollouts"]
+        assert len(simulated[budget]) == 3
+        shown = [mean_success(cells, bc), mean_success(simulated[budget], "simulated_ppo")]
+        shown += [mean_success(cells, method) for method in imagined]
+        assert f"| {title} | {len(cells)} | {' | '.join(shown)} |" in text
+    act = read_all("value_act")
+    bc, ppo, distilled = (
+        mean_success(act, name) for name in ("longer_filtered", "imagined_ppo", "distilled")
+    )
+    assert best_bc(act) == "longer_filtered"
+    assert f"| {len(act)} | {bc} | – | {ppo} | {distilled} |" in text
+    (pick_place,) = groups(loader(ROOT / "docs"), SECOND_STUDY, SECOND_PARTS).values()
+    bc, ppo = (mean_success(pick_place, name) for name in ("longer_filtered", "longer_discounted_ppo"))
+    (one,) = read_all("value_pick_place_simulator")
+    assert best(pick_place, BASELINES, "ind") == "longer_filtered"
+    assert f"| {len(pick_place)} | {bc} | {mean_success([one], 'simulated_ppo')} (one) | {ppo} | – |" in text
+    tasks, (one,) = read_all("value_four_tasks"), read_all("value_four_tasks_simulator")
+    bc, ppo = (mean_over_tasks(tasks, method) for method in ("longer", "imagined_ppo"))
+    simulator = mean_over_tasks([one], "simulated_ppo")
+    assert f"| {len(tasks)} | {bc} | {simulator} (one) | {ppo} | – |" in text
+    assert one["seed"] == tasks[0]["seed"]
+    assert f"(same seed: {mean_over_tasks(tasks[:1], 'imagined_ppo')} in imagination)" in text
+
+
+def test_the_readme_says_what_is_chance() -> None:
+    """Gains by Student's t over the seeds: over BC on the same recordings, and over PPO in ManiSkill."""
+    text, rows = (ROOT / "README.md").read_text(), push_rows()
+    cells, (bc, *methods) = rows["[25 + 300](docs/results.md#value_same_recordings)"]
+    assert len(cells) == 3
+    for method, domain in product(methods, SCENES):
+        assert seed_interval(cells, method, bc, domain)[0] < 0
+    cells, (bc, ppo, distilled) = rows["[8 + 300](docs/results.md#value_rewards)"]
+    (known, unseen), others = (
+        [in_words(*seed_interval(cells, method, bc, domain)) for domain in SCENES]
+        for method in (ppo, distilled)
+    )
+    said = f"PPO gains {known} points in known and {unseen} in unseen scenes, distillation"
+    assert f"{said} {' and '.join(others)}." in text
+    for (demonstrations, _), found in groups(loader(ROOT / "docs")).items():
+        for method in ("imagined_ppo", "ppo_distilled") if demonstrations > 8 else ():
+            for domain in SCENES:
+                gain = ttest_1samp(gains(found, method, "simulated_ppo", domain), 0)
+                assert gain.pvalue > 0.05, "over PPO in ManiSkill"
+    (pick_place,) = groups(loader(ROOT / "docs"), SECOND_STUDY, SECOND_PARTS).values()
+    over_seeds = ttest_1samp(gains(pick_place, "longer_discounted_ppo", "longer_filtered", "ind"), 0)
+    assert over_seeds.pvalue > 0.05, "not significant over seeds"
+    by_seed = in_points(pick_place, "longer_discounted_ppo", "longer_filtered")
+    others = in_points(pick_place, "longer_imagined_ppo", "longer_filtered")
+    assert f"(by seed {by_seed}; with another discount {others}), three seeds prove none" in text
+
+
+def test_the_readme_says_what_else_was_measured() -> None:
+    text = (ROOT / "README.md").read_text()
+    places = json.loads((RESULTS / "demo.json").read_text())["runs"][0]["places"]
     known, unseen = (places[where]["policies"] for where in ("in known scenes", "in unseen scenes"))
     said = {SFT: " % before", CLONED: " after further BC", PPO: " after PPO", DISTILLED: " after a planner"}
     for policy, words in said.items():
-        shares = (round(100 * rates[policy]["share"]) for rates in (known, unseen))
-        assert f"{'/'.join(map(str, shares))}{words}" in text
-    for study, method, words in (
-        ("value_four_tasks", "longer", "longer BC"),
-        ("value_four_tasks", "imagined_ppo", "PPO in imagination"),
-        ("value_four_tasks_simulator", "simulated_ppo", "PPO in ManiSkill"),
-    ):
-        cells = [json.loads(path.read_text()) for path in (results / study).glob("*.json")]
-        tasks = [task for cell in cells for task in cell["tasks"].values()]
-        shares = ([task[domain][method]["share"] for task in tasks] for domain in ("ind", "ood"))
-        assert f"{'/'.join(f'{100 * np.mean(each):.0f}' for each in shares)} after {words}" in text
-    longer = [json.loads(path.read_text()) for path in (results / "value_longer").glob("*.json")]
-    for demonstrations in {cell["demonstrations"] for cell in longer}:
-        found = [
-            cell["methods"]["longer_filtered"] for cell in longer if cell["demonstrations"] == demonstrations
-        ]
-        shares = ([each[domain]["share"] for each in found] for domain in ("ind", "ood"))
-        assert f"{'/'.join(f'{100 * np.mean(each):.0f}' for each in shares)} with {demonstrations}" in text
+        assert f"{in_percent(*(rates[policy]['share'] for rates in (known, unseen)))}{words}" in text
+    assert f"[{mean_success(read_all('driven'), 'optimal_cloning')}](docs/results.md#driven)" in text
+    gate = json.loads((RESULTS / "world_model_gate_anchored.json").read_text())
+    known, unseen = (
+        in_percent(gate[scenes]["false_positive_rate"]["share"]) for scenes in ("known", "unseen")
+    )
+    assert f"success for {known} % of failures in known and {unseen} % in unseen scenes" in text
+
+
+def test_the_objections_say_what_was_measured() -> None:
+    text, cells = (ROOT / "docs" / "objections.md").read_text(), read_all("value_rewards")
+    over = [
+        [in_percent(each) for each in gains(cells, "distilled", "longer_filtered", domain)]
+        for domain in SCENES
+    ]
+    known, unseen = (f"{', '.join(each[:-1])} and {each[-1]}" for each in over)
+    assert f"by seed {known} points more than BC in known scenes, {unseen} in unseen ones" in text
     (pick_place,) = groups(loader(ROOT / "docs"), SECOND_STUDY, SECOND_PARTS).values()
-    before, after = (
-        "/".join(str(best_success(pick_place, (method,), domain)) for domain in ("ind", "ood"))
-        for method in ("longer_filtered", "longer_discounted_ppo")
-    )
-    by_seed = in_points(pick_place, "longer_discounted_ppo", "longer_filtered")
-    assert f"longer BC has {before}, PPO from it {after} (three seeds: {by_seed} points in known" in text
-    assert f"with another discount {in_points(pick_place, 'longer_imagined_ppo', 'longer_filtered')})" in text
-    assert len(pick_place) == 3
-    rounds = {
-        method: "/".join(str(best_success(pick_place, (method,), domain)) for domain in ("ind", "ood"))
-        for method in ("iterated", "iterated_ppo")
-    }
+    bc, ppo = (mean_success(pick_place, method) for method in ("iterated", "iterated_ppo"))
     in_rounds = in_points(pick_place, "iterated_ppo", "iterated").replace(", 22", " and 22")
-    objections = (ROOT / "docs" / "objections.md").read_text()
-    said_of_rounds = (
-        f"BC has {rounds['iterated']} and PPO from it {rounds['iterated_ppo']}: by seed {in_rounds}"
-    )
-    assert said_of_rounds in objections
-    assert best(pick_place, BASELINES, "ind") == "longer_filtered"
-    over_seeds = ttest_1samp(gains(pick_place, "longer_discounted_ppo", "longer_filtered", "ind"), 0)
-    assert over_seeds.pvalue > 0.05, "not significant over seeds"
-    driven = [json.loads(path.read_text()) for path in (results / "driven").glob("*.json")]
-    optimal = [cell["methods"]["optimal_cloning"] for cell in driven]
-    shares = ([each[domain]["share"] for each in optimal] for domain in ("ind", "ood"))
-    assert f"[{'/'.join(f'{100 * np.mean(each):.0f}' for each in shares)}](docs/results.md#driven)" in text
-    words = {
-        ("world_model_gate_anchored", "known"): "{} % of failures in known",
-        ("world_model_gate_anchored", "unseen"): "{} % in unseen scenes",
-    }
-    for (stem, domain), phrase in words.items():
-        gate = json.loads((results / f"{stem}.json").read_text())[domain]
-        assert phrase.format(round(100 * gate["false_positive_rate"]["share"])) in text
+    assert f"BC has {bc} and PPO from it {ppo}: by seed {in_rounds}" in text
 
 
 @pytest.mark.parametrize("page", sorted(FOLDER.glob("*.txt")), ids=lambda page: page.stem)

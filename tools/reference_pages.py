@@ -16,7 +16,11 @@ from lerobot_wmrl.common.stored_help import FOLDER
 
 ROOT: Final = Path(__file__).parents[1]
 TYPES: Final = {
-    "lerobot-wmrl-record": (["--env.type=wmrl_maniskill"], ["--env.type=world_model"]),
+    "lerobot-wmrl-record": (
+        ["--env.type=wmrl_maniskill"],
+        ["--env.type=world_model"],
+        ["--policy.type=wm_mpc"],
+    ),
     "lerobot-wmrl-train-world-model": (
         ["--model.type=action_world_model"],
         ["--model.type=action_world_model", "--model.dynamics.type=autoregressive"],
@@ -28,7 +32,11 @@ TYPES: Final = {
         ["--success.type=reward_model"],
         ["--success.type=by_hand"],
     ),
-    "lerobot-wmrl-train": (["--env.type=world_model"], ["--algorithm.type=grpo"]),
+    "lerobot-wmrl-train": (
+        ["--env.type=world_model"],
+        ["--algorithm.type=grpo"],
+        ["--algorithm.type=distillation"],
+    ),
 }
 """Flags that choose types, whose own flags a page shows beside `--help` alone."""
 

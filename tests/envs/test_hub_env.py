@@ -15,7 +15,7 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.envs.configuration_hub import HubEnv
 from lerobot_wmrl.envs.lerobot_env import make_tensor_env, runs_in_processes
-from lerobot_wmrl.improve import commands
+from lerobot_wmrl.improve.stages import list_stages
 from tests.commands import run_here
 from tests.hub_client import hub as hub
 from tests.hub_server import Hub, Repo
@@ -149,6 +149,6 @@ def test_improving_a_policy_there_is_planned_before_it_is_done(hub: Hub, tmp_pat
     improvement = improvement_of(tmp_path)
     config = improvement.plan.config
     config.real_env, config.rollouts = HubEnv(hub_path=PATH, trust_remote_code=True, fps=10), 2
-    recording = commands.stages(improvement)[0].command()
+    recording = list_stages(improvement)[0].command()
     named = f"--env.type=hub --env.fps=10 --env.hub_path={PATH} --env.trust_remote_code=true"
     assert named in " ".join(recording)
