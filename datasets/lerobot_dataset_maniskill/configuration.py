@@ -18,6 +18,7 @@ from lerobot_wmrl.common.checkpoints import PARTS, checkpoint_digest, resolved_n
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import KINDS, POLICY
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
+from lerobot_wmrl.common.files import require_no_mount
 from lerobot_wmrl.common.hub import check_login
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.policy_checks import require_trained
@@ -140,6 +141,7 @@ class RecordConfig(RunConfig):
             self.policy = read_policy_config(path, settings)
         if self.output_dir is None:
             raise FieldError("output_dir", None, "missing", "give the folder for the dataset")
+        require_no_mount("output_dir", self.root)
         require_at_least(self, 1, "num_episodes", "num_workers", "part_episodes")
         if self.max_frames is not None:
             require_at_least(self, 1, "max_frames")
@@ -246,9 +248,10 @@ class RecordConfig(RunConfig):
 
     @property
     def root(self) -> Path:
-        """Root of the dataset, for use after `validate`."""
+        """Root of the dataset, for use after `validate`. Of a link it is what that leads to: what is not
+        finished yet stands beside it, on the same disk."""
         assert self.output_dir is not None
-        return self.output_dir
+        return self.output_dir.resolve() if self.output_dir.is_symlink() else self.output_dir
 
     @property
     def elsewhere(self) -> bool:
@@ -290,7 +293,8 @@ class RecordConfig(RunConfig):
     @property
     def dataset_id(self) -> str:
         """Name of the dataset."""
-        return self.repo_id or f"{LOCAL}/{self.root.name}"
+        assert self.output_dir is not None
+        return self.repo_id or f"{LOCAL}/{self.output_dir.name}"
 
     def recorded_content(self) -> dict[str, Any]:
         """Return the settings that decide the episodes. A folder with the same continues this recording.

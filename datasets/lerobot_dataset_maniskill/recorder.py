@@ -176,7 +176,9 @@ def merge(source: Source, work: Path, root: Path, repo_id: str) -> None:
     shutil.rmtree(merged, ignore_errors=True)
     merge_folders([work / name for name in source.parts], merged, repo_id)
     if problem := find_damage(merged, sum(source.parts.values())):
-        raise ValueError(f"{work}: merging failed: {problem}; remove the folder and record again")
+        raise ValueError(
+            f"{work}: merging failed: {problem}; run the same command again: it records damaged parts anew"
+        )
     report = source.describe(merged)
-    merged.replace(root.resolve())
+    merged.replace(root)
     print(report)

@@ -97,6 +97,7 @@ def create_dataset(
         robot_type="panda",
         use_videos=video or depth,
         streaming_encoding=True,
+        encoder_queue_maxsize=0,  # without a limit: where there is one, LeRobot drops the frames beyond it
         encoder_threads=1,
         rgb_encoder=video_encoder(),
         depth_encoder=depth_encoder(),

@@ -19,9 +19,9 @@ def clip_actions(actions: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Te
 
 
 def warn_of_clipped(shares: Sequence[float]) -> None:
-    """Warn if components of a policy's actions were clipped; `shares` has one value for each action."""
+    """Warn if components of actions were clipped; `shares` has one value for each action."""
     if any(shares):
         logging.warning(
-            "%.1f %% of the components of the policy's actions were out of range, and clipped to it",
+            "%.1f %% of the components of the actions were out of range, and clipped to it",
             100 * np.mean(shares),
         )

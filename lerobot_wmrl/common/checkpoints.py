@@ -174,6 +174,8 @@ def write_checkpoint(output_dir: Path, total_steps: int, step: int, write: Calla
 
 def link_checkpoint(checkpoint: Path, name: str) -> None:
     """Point `checkpoints/<name>` at a checkpoint beside it; a reader finds the old one or the new one."""
+    if checkpoint.with_name(name).resolve() == checkpoint.resolve():
+        return
     partial = checkpoint.with_name(f".{name}.partial")
     partial.unlink(missing_ok=True)
     partial.symlink_to(checkpoint.name)
@@ -249,9 +251,7 @@ def newest_checkpoint(output_dir: Path) -> Path | None:
 
 def link_latest(output_dir: Path) -> None:
     """Point `last` at the latest checkpoint, if there is one: a kill may have come between the two."""
-    checkpoint = newest_checkpoint(output_dir)
-    linked = (output_dir / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK).resolve()
-    if checkpoint is not None and linked != checkpoint.resolve():
+    if checkpoint := newest_checkpoint(output_dir):
         link_checkpoint(checkpoint, LAST_CHECKPOINT_LINK)
 
 

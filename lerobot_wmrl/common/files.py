@@ -41,6 +41,11 @@ def require_new(field: str, target: Path) -> None:
     """Raise FieldError if there is something at `target` already, other than an empty folder."""
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise FieldError(field, target, "there is something already", "choose a new folder")
+    require_no_mount(field, target)
+
+
+def require_no_mount(field: str, target: Path) -> None:
+    """Raise FieldError if a disk is mounted at `target`."""
     if target.is_mount():
         raise FieldError(
             field,

@@ -20,7 +20,8 @@ DENIED: Final = (401, 403, 404)
 def cached_repo(folder: Path) -> str | None:
     """Return the name of the repository in the hub's cache (`datasets--user--name`) of which a folder is a
     revision, None if it is none."""
-    return folder.parents[1].name if folder.parent.name == "snapshots" else None
+    name = folder.parents[1].name if folder.parent.name == "snapshots" else ""
+    return name if name.startswith(("datasets--", "models--")) else None
 
 
 def published_name(path: str | Path) -> tuple[str, str | None] | None:

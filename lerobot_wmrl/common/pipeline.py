@@ -47,8 +47,8 @@ def make_pipeline(
     postprocessor: Any,
     shown: Callable[[Observation], Observation] = unchanged,
 ) -> Pipeline:
-    """Wrap a policy's processors. Observations that the policy has no input for are left out. Actions stay on
-    the policy's device, where LeRobot's postprocessors would move them to the CPU."""
+    """Wrap a policy's processors. What the policy has no input for is not stored. Actions stay on the
+    policy's device, where LeRobot's postprocessors would move them to the CPU."""
     known = {*(config.input_features or {}), INSTRUCTIONS, ACTION, ACTION_IS_PAD}
     steps = [
         replace(step, device=config.device) if isinstance(step, DeviceProcessorStep) else step
@@ -56,13 +56,16 @@ def make_pipeline(
     ]
     on_device = replace(postprocessor, steps=steps)
 
+    def store(observation: Observation) -> Observation:
+        return {name: value for name, value in observation.items() if name in known}
+
     def prepare(observation: Observation) -> Observation:
-        return preprocessor(shown({name: value for name, value in observation.items() if name in known}))
+        return preprocessor(shown(store(observation)))
 
     def to_action(raw_action: Tensor) -> Tensor:
         return on_device(raw_action)
 
-    return Pipeline(prepare, to_action, shown=shown, action_unit=action_unit(config, postprocessor))
+    return Pipeline(prepare, to_action, store, shown, action_unit=action_unit(config, postprocessor))
 
 
 def action_unit(config: PreTrainedConfig, postprocessor: Any) -> Tensor | None:

@@ -1,6 +1,7 @@
 """Where LeRobotDatasets are: named on a command line, opened, downloaded, and known by what they hold."""
 
 import hashlib
+import logging
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from functools import partial
@@ -21,7 +22,7 @@ from lerobot.utils.utils import SuppressProgressBars
 from lerobot_wmrl.common.errors import FieldError, first_line, renamed
 from lerobot_wmrl.common.flags import flag_as_typed
 from lerobot_wmrl.data.embodiment import whole_rate
-from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes, require_episodes
+from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes, require_chosen
 
 VIDEO_BACKEND: Final = "pyav"
 """pyav ships its own FFmpeg, torchcodec needs the system's. Speed matters little: frames are decoded once."""
@@ -81,7 +82,21 @@ class DatasetSource:
             raise FieldError(
                 "dataset.root", self.root, "no dataset is named", "give `dataset.root` or `dataset.repo_id`"
             )
+        if self.revision and not self.repo_id:
+            raise FieldError(
+                "dataset.revision",
+                self.revision,
+                "is one of a dataset on the hub, and none is named",
+                "give `dataset.repo_id`, or leave it out",
+            )
         if not self.repo_id or (self.root and (is_whole(Path(self.root), episodes) or unfinished(self.root))):
+            if self.revision:
+                logging.warning(
+                    "dataset.revision=%s: %s holds a whole dataset, which is used as it is, whatever its "
+                    "revision; give a new folder to download this one",
+                    self.revision,
+                    self.root,
+                )
             return open_dataset(self.root, self.repo_id, episodes)
         try:
             return download_dataset(self.repo_id, self.revision, self.root or None, episodes)
@@ -230,10 +245,8 @@ def open_rows(repo_id: str, episodes: Collection[int] | None, **where: Any) -> L
     open_videos_of = partial(LeRobotDataset, repo_id, video_backend=VIDEO_BACKEND, **where)
     if episodes is None:
         return open_videos_of()
-    if not episodes:
-        raise FieldError("dataset.episodes", [], "chooses no episode", "leave it out for all")
     meta = LeRobotDatasetMetadata(repo_id, **where)
-    require_episodes("dataset.episodes", episodes, meta.total_episodes, meta.root)
+    require_chosen(episodes, meta.total_episodes, meta.root)
     dataset = open_videos_of(episodes=list(episodes))
     if missing_files(dataset.root, episodes):
         snapshot_download(

@@ -212,7 +212,7 @@ def check_same_robot(embodiment: Embodiment, meta: Any) -> None:
     """
     for column, names in ((ACTION, embodiment.action_names), (OBS_STATE, embodiment.state_names)):
         parts = component_names(meta.features[column]) if column in meta.features else []
-        unnamed = any(each and each[0].isdigit() for each in (*parts[:1], *names[:1]))
+        unnamed = any(each.isdecimal() for each in (*parts[:1], *names[:1]))
         if names and parts and not unnamed and names != parts:
             raise FieldError(
                 "dataset.root",

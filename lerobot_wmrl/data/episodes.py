@@ -128,10 +128,14 @@ class EpisodeTable:
         )
 
     def among(self, chosen: Sequence[int] | None) -> np.ndarray:
-        """Mark the episodes that are `chosen`, all if None. FieldError names one that does not exist. (E,)"""
+        """Mark the episodes that are `chosen`, all if None. (E,)
+
+        Raises:
+            FieldError: none is chosen, or one that does not exist.
+        """
         indices = np.arange(len(self.start))
-        if chosen:
-            require_episodes("dataset.episodes", chosen, len(indices), self.dataset.root)
+        if chosen is not None:
+            require_chosen(chosen, len(indices), self.dataset.root)
         return indices >= 0 if chosen is None else np.isin(indices, chosen)
 
     def training(self, chosen: Sequence[int] | None) -> np.ndarray:
@@ -139,6 +143,13 @@ class EpisodeTable:
         FieldError names one that does not exist. (E,)"""
         marked: np.ndarray = self.among(chosen) & ~self.validation
         return marked
+
+
+def require_chosen(episodes: Collection[int], total: int, root: Path) -> None:
+    """Raise FieldError about `dataset.episodes` if it chooses no episode, or one that does not exist."""
+    if not episodes:
+        raise FieldError("dataset.episodes", [], "chooses no episode", "leave it out for all")
+    require_episodes("dataset.episodes", episodes, total, root)
 
 
 def require_episodes(name: str, chosen: Collection[int], total: int, root: Path) -> None:

@@ -1,5 +1,8 @@
 """A tensor environment in numpy, for lerobot-eval."""
 
+import logging
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -29,11 +32,14 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, env.num_envs)
         self._max_episode_steps = self.env.max_episode_steps
         self._clipped: list[float] = []
+        self._seeds = set[int]()
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode in every sub-environment; `seed` is an int or one for each of them."""
+        if isinstance(seed, list | tuple):
+            self._count_starts(seed)
         self._last, info = self.env.reset(seed=seed)
         self._frozen = torch.zeros(self.num_envs, dtype=torch.bool, device=self.env.device)
         self._success = torch.zeros_like(self._frozen)
@@ -58,6 +64,21 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         )
         flags = (terminated & ended).cpu().numpy(), (truncated & ended).cpu().numpy()
         return self._to_numpy(self._last), reward.cpu().numpy(), *flags, result
+
+    def _count_starts(self, seeds: Sequence[int]) -> None:
+        """Warn, once, of a world model's episodes that begin where another one has begun."""
+        starts = len(getattr(self.env, "starts", ())) or math.inf
+        before = len(self._seeds)
+        self._seeds.update(seeds)
+        if before <= starts < len(self._seeds):
+            logging.warning(
+                "there are %d starts for %d episodes or more: from the same start a policy that draws no "
+                "actions does the same again, which says nothing new. Ask for %d episodes, or give more "
+                "starts (env.dataset)",
+                starts,
+                len(self._seeds),
+                starts,
+            )
 
     def _count_clipped(self, shares: Tensor | None) -> None:
         """Keep the share of action components (B,) that were out of range, of environments that go on."""

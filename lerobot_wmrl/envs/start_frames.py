@@ -243,6 +243,13 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
     for name in shapes:
         if arrays[name].dtype != np.uint8:
             raise FieldError("dataset.frames", path, f"{name} is {arrays[name].dtype}, it must be uint8")
+    if arrays[INSTRUCTIONS].dtype.kind != "U":
+        raise FieldError(
+            "dataset.frames",
+            path,
+            f"{INSTRUCTIONS} is {arrays[INSTRUCTIONS].dtype}, it must be text",
+            "save an array of str",
+        )
     rows = evenly_spaced(count, max_starts)
     state = arrays[OBS_STATE][rows].astype(np.float32) if states else np.zeros((len(rows), 0), np.float32)
     if not np.isfinite(state).all():

@@ -68,9 +68,8 @@ def reward_along_episode(
 
 
 def paid_once(probability: Tensor, criterion: SuccessCriterion) -> Tensor:
-    """Return 1 for the frame at which an episode has met the criterion, 0 for the others but the first,
-    which is none of an action. (T,) → (T - 1,)"""
-    paid = torch.zeros_like(probability[1:])
+    """Return 1 for the frame at which an episode has met the criterion, 0 for the others. (T,) → (T,)"""
+    paid = torch.zeros_like(probability)
     (begin,) = criterion.first_met(probability.cpu().numpy()[None])
     if begin >= 0:
         paid[begin + criterion.frames - 1] = 1

@@ -153,7 +153,7 @@ class LabelPage:
         try:
             stored = json.loads(self.file.read_text())
             given = {int(episode): first for episode, first in stored["labels"].items()}
-            same = {name: stored.get(name) for name in self.about} == self.about
+            same = all(stored.get(name) == self.about[name] for name in ("content", "lengths"))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise FieldError("file", self.file, "holds no labels", "choose another file") from error
         if not same:

@@ -65,7 +65,12 @@ class Visit:
     def _begin(self, message: Mapping[str, Any]) -> dict[str, Any]:
         if self.real_env is None and "seed" in message:
             self.real_env = self.world.make_real_env()
-        self.drive = self.world.begin(message, self.real_env)
+        try:
+            self.drive = self.world.begin(message, self.real_env)
+        except ValueError:
+            if self.drive is not None and "seed" in message:  # the real environment may stand elsewhere now
+                self.drive.synchronized = False
+            raise
         self.driver = ""
         self.place = {name: message[name] for name in message if name != "do"}
         return self._resume(message)

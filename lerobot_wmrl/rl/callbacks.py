@@ -71,11 +71,10 @@ class Callbacks:
                 self._apply(callback)
 
     def _read_records(self, name: str, iteration: int) -> None:
-        for folder in sorted((self.output_dir / name).glob("[0-9]*")):
+        for folder in (self.output_dir / name).glob("[0-9]*"):
             if int(folder.name) > iteration:
                 shutil.rmtree(folder, ignore_errors=True)
-            elif (folder / RECORD_FILE).is_file():
-                self.records[name][int(folder.name)] = json.loads((folder / RECORD_FILE).read_text())
+        self.records[name] |= read_records(self.output_dir, name)
 
     def _apply(self, callback: Callback) -> None:
         """Apply, and restore the training's generators: loading a model draws random initial weights."""
@@ -123,6 +122,12 @@ def record_folder(output_dir: Path, name: str, iteration: int, total: int) -> Pa
 def has_record(output_dir: Path, name: str, iteration: int, total: int) -> bool:
     """Return whether the callback of this name has a record of the iteration."""
     return (record_folder(output_dir, name, iteration, total) / RECORD_FILE).is_file()
+
+
+def read_records(output_dir: Path, name: str) -> dict[int, Record]:
+    """Return all records of the callback of this name, by iteration."""
+    found = sorted((output_dir / name).glob(f"[0-9]*/{RECORD_FILE}"))
+    return {int(path.parent.name): json.loads(path.read_text()) for path in found}
 
 
 def read_record(output_dir: Path, name: str, iteration: int, total: int) -> Record:

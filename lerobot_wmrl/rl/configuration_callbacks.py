@@ -109,7 +109,9 @@ class CallbackSettings:
         """Raise FieldError for the first setting that does not fit a training in `env`."""
         require_at_least(self, 1, "real_num_envs")
         self._check_selection_and_gate()
-        if isinstance(env, WorldModelEnv) and self.gate.action == "stop":
+        if not isinstance(env, WorldModelEnv):
+            self._refuse_datasets(env)
+        elif self.gate.action == "stop":
             self._check_gate_has_labels()
         self._check_dyna_sizes(iterations)
         if self.dyna.rounds:
@@ -141,6 +143,17 @@ class CallbackSettings:
                 "counted nowhere",
                 "leave out `real_env.type`, or `selection.freq`",
             )
+
+    def _refuse_datasets(self, env: EnvConfig) -> None:
+        """Raise FieldError for a dataset that nothing reads outside a world model."""
+        for name, source in (("gate", self.gate.dataset), ("selection", self.selection.dataset)):
+            if source.given:
+                raise FieldError(
+                    f"{name}.dataset.root",
+                    source.name,
+                    f"is read in a world model alone, and `env.type` is {env.type}",
+                    "leave it out",
+                )
 
     def _check_gate_has_labels(self) -> None:
         if not self.gate.dataset.given and self.real_env is None:

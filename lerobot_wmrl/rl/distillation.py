@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import torch
 from lerobot.rl.algorithms.configs import TrainingStats
+from lerobot.utils.constants import OBS_STATE
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from tqdm import tqdm
@@ -106,9 +107,10 @@ class Distillation(Algorithm):
     ) -> dict[str, float]:
         started = time.perf_counter()
         if self.config.recorded and not self.labels.recorded:
-            model = env.model.config
+            seen = self.lerobot_policy.config.input_features
+            state_size = env.model.config.state_size if OBS_STATE in seen else 0
             self.labels.recorded = recorded_successes(
-                env.config.dataset, model.tokenizer.frame_shapes, model.state_size, self.windows
+                env.config.dataset, self.seen_shapes(env), state_size, self.windows
             )
         shown = self.demonstrate(env, pipeline, rollout, seed)
         part = imagined_labels(rollout.observations, shown.actions, shown.labelled, self.windows)
@@ -164,7 +166,7 @@ class Distillation(Algorithm):
         observation, _ = env.reset(seed=seed)
         with seeded_noise(seed, env.device):
             for step in tqdm(range(steps), "rollout", leave=False, unit="step", disable=hidden_progress()):
-                rollout.observations.write(step, observation)
+                rollout.observations.write(step, pipeline.store(observation))
                 if step < lead:
                     inputs = pipeline.prepare(rollout.observations.read_step(step))
                     actions[step] = pipeline.to_action(policy.select_action(inputs)).to(env.device)
@@ -211,12 +213,17 @@ class Distillation(Algorithm):
             return torch.ones_like(deviation, dtype=torch.bool)
         return pipeline.action_unit.to(env.device) >= LEAST_STD_SHARE * deviation
 
+    def seen_shapes(self, env: WorldModelVectorEnv) -> dict[str, tuple[int, int, int]]:
+        """Return the shapes (3, H, W) of the frames that the policy sees, by camera."""
+        shapes, seen = env.model.config.tokenizer.frame_shapes, self.lerobot_policy.config.input_features
+        return {camera: shape for camera, shape in shapes.items() if camera in seen}
+
     def check_dataset(self, env: WorldModelVectorEnv, pipeline: Pipeline) -> None:
         """Raise FieldError if recorded successes are learnt from, and do not fit into memory or vary in what
         the policy cannot learn."""
         if not self.config.recorded:
             return
-        require_memory(env.config.dataset, env.model.config.tokenizer.frame_shapes)
+        require_memory(env.config.dataset, self.seen_shapes(env))
         strange = (~self.learnt_components(env, pipeline)).nonzero().flatten().tolist()
         if strange:
             name = env.model.config.embodiment.action_names[strange[0]]

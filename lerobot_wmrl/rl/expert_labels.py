@@ -15,12 +15,12 @@ import psutil
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
 from lerobot_wmrl.common.constants import INSTRUCTIONS, Observation
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, TrainingStopped, first_line
 from lerobot_wmrl.common.images import stretch
 from lerobot_wmrl.common.pipeline import ACTION_IS_PAD
 from lerobot_wmrl.data.decoding import decode, rows_of
@@ -105,10 +105,21 @@ class ExpertLabels:
         return self.folder / f"{iteration:06d}-{self.process}.safetensors"
 
     def add(self, iteration: int, part: ExpertLabelBatch) -> None:
-        """Add an iteration's labels, on disk first."""
+        """Add an iteration's labels, on disk first.
+
+        Raises:
+            TrainingStopped: they do not fit into memory beside those of the iterations before.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
         partial = self.path(iteration).with_suffix(".partial")
         tensors = {**part.observations, **part.actions, ROWS: part.rows}
+        size, free = sum(each.nbytes for each in tensors.values()), psutil.virtual_memory().available
+        if local_processes() * size > free:
+            raise TrainingStopped(
+                f"iteration {iteration + 1}: the frames of its labels take {size / 1e9:.1f} GB of memory in "
+                f"each process, and {free / 1e9:.1f} GB are free beside those of the iterations before; the "
+                "last checkpoint is kept: lower `num_envs` or `iterations`"
+            )
         kept = {name: value.cpu().contiguous() for name, value in tensors.items()}
         save_file(kept, partial, {"instructions": json.dumps(part.instructions)})
         partial.replace(self.path(iteration))
@@ -118,13 +129,20 @@ class ExpertLabels:
         """Read the labels of the iterations before `iterations`, in place of those in memory.
 
         Raises:
-            FileNotFoundError: a file is missing.
+            ValueError: a file is missing or truncated.
         """
         self.imagined = []
         for iteration in range(iterations):
-            with safe_open(self.path(iteration), framework="pt") as file:
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-                self._append(tensors, json.loads(file.metadata()["instructions"]))
+            try:
+                with safe_open(self.path(iteration), framework="pt") as file:
+                    tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+                    self._append(tensors, json.loads(file.metadata()["instructions"]))
+            except (SafetensorError, OSError) as error:
+                raise ValueError(
+                    f"{self.path(iteration)}: cannot be read ({first_line(error)}): it has the labels of "
+                    f"iteration {iteration + 1}; restore it, or train from the beginning in another "
+                    "`output_dir`"
+                ) from error
 
     def draw(self, count: int, shown: Callable[[Observation], Observation]) -> dict[str, Any]:
         """Draw a batch of labels at random, as LeRobot's datasets would give them: images in [0, 1].
@@ -211,8 +229,7 @@ def require_memory(source: StartFrames, frame_shapes: Mapping[str, tuple[int, in
     if not source.given:
         return
     table, episodes = successes(source)
-    processes = int(os.environ.get("LOCAL_WORLD_SIZE", 1))
-    size = processes * int(table.length[episodes].sum()) * sum(map(math.prod, frame_shapes.values()))
+    size = local_processes() * int(table.length[episodes].sum()) * sum(map(math.prod, frame_shapes.values()))
     free = psutil.virtual_memory().available
     if size > free:
         raise FieldError(
@@ -222,6 +239,11 @@ def require_memory(source: StartFrames, frame_shapes: Mapping[str, tuple[int, in
             f"{free / 1e9:.1f} GB are free",
             "set it to false, or choose fewer episodes (`env.dataset.episodes`)",
         )
+
+
+def local_processes() -> int:
+    """Return how many processes of `torchrun` share this machine's memory."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", 1))
 
 
 def imagined_labels(

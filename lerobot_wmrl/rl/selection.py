@@ -63,11 +63,8 @@ class Selection:
         Raises:
             TrainingStopped: real success has fallen while imagined success has not.
         """
-        latest = max(records)
-        since = max((each for each in self.refreshed if each <= latest), default=0)
-        comparable = {iteration: record for iteration, record in records.items() if iteration >= since}
-        best = best_iteration(records if self.judge == REAL else comparable, self.judge)
-        checkpoint = checkpoint_dir(self.output_dir, self.total, best)
+        latest, comparable = max(records), in_one_world_model(records, self.refreshed)
+        checkpoint = best_checkpoint(self.output_dir, self.total, records, self.judge, self.refreshed)
         if is_first_process():
             link_checkpoint(checkpoint, BEST_CHECKPOINT_LINK)
         earlier = best_iteration(comparable, self.judge)
@@ -83,6 +80,20 @@ class Selection:
                 "(`dyna.rounds`), keep the policy nearer to the SFT policy "
                 "(`algorithm.reference_coefficient` of PPO and GRPO), or stop earlier (`iterations`)"
             )
+
+
+def in_one_world_model(records: Mapping[int, Record], refreshed: Collection[int]) -> dict[int, Record]:
+    """Return the records since the last Dyna round: success in imagination is compared among these alone."""
+    since = max((each for each in refreshed if each <= max(records)), default=0)
+    return {iteration: record for iteration, record in records.items() if iteration >= since}
+
+
+def best_checkpoint(
+    output_dir: Path, total: int, records: Mapping[int, Record], judge: str, refreshed: Collection[int]
+) -> Path:
+    """Return the checkpoint with most successes where `judge` says, `real` or `imagined`."""
+    comparable = records if judge == REAL else in_one_world_model(records, refreshed)
+    return checkpoint_dir(output_dir, total, best_iteration(comparable, judge))
 
 
 def success(record: Record, place: str) -> Proportion:

@@ -15,6 +15,7 @@ finished batch. With early stopping `--n_episodes` may then be higher: the test 
 
 import json
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import draccus
@@ -108,7 +109,10 @@ def compare(cfg: CompareConfig) -> None:
     comparison = Comparison(
         cfg.policies, cfg.n_episodes, cfg.against, cfg.alpha, cfg.stop_early, stored_episodes(cfg)
     )
-    if not comparison.finished:
+    if comparison.finished:  # perhaps since fewer episodes are asked for than before
+        with claim.held():
+            write_results(cfg, claim, comparison)
+    else:
         run(cfg, claim, comparison, configs)
     save_comparison(comparison, cfg.output_dir / "comparison.png")
     print(f"{comparison}\n{COMPARISON_FILE} and comparison.png are in {cfg.output_dir}")
@@ -136,11 +140,7 @@ def run(
 ) -> None:
     """Run the episodes that are missing; write the results after every batch."""
     assert cfg.env is not None
-
-    def save() -> None:
-        results = {"env": claim.settings["env"], "seed": cfg.seed, **comparison.as_json()}
-        write_json(cfg.output_dir / COMPARISON_FILE, results)
-
+    save = partial(write_results, cfg, claim, comparison)
     with (
         writing("output_dir", cfg.output_dir),
         opened(cfg.env, cfg.batch_size, cfg.trust_remote_code, len(configs)) as envs,
@@ -150,6 +150,12 @@ def run(
         with claim.held():
             comparison.episodes[:] = stored_episodes(cfg)  # another command may have added some meanwhile
             run_comparison(comparison, envs, cfg.env, policies, cfg.batch_size, cfg.seed, save)
+
+
+def write_results(cfg: CompareConfig, claim: Claim, comparison: Comparison) -> None:
+    """Write comparison.json."""
+    results = {"env": claim.settings["env"], "seed": cfg.seed, **comparison.as_json()}
+    write_json(cfg.output_dir / COMPARISON_FILE, results)
 
 
 def main() -> None:

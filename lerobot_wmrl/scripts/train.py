@@ -27,7 +27,9 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_wmrl.common.checkpoints import (
+    BEST_CHECKPOINT_LINK,
     checkpoint_digest,
+    link_checkpoint,
     link_latest,
     newest_checkpoint,
     require_resumable,
@@ -53,12 +55,13 @@ from lerobot_wmrl.envs.lerobot_env import make_tensor_env
 from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.budget import charge_steps, check_data
-from lerobot_wmrl.rl.callbacks import has_record
+from lerobot_wmrl.rl.callbacks import has_record, read_records
 from lerobot_wmrl.rl.compatibility import match_policy_to_env, rollout_length, settle_discount
 from lerobot_wmrl.rl.configuration_train import MAY_DIFFER, TrainConfig, resolve_policy
+from lerobot_wmrl.rl.dyna import round_iterations
 from lerobot_wmrl.rl.make_callbacks import make_callbacks
 from lerobot_wmrl.rl.rollout import RolloutBuffer
-from lerobot_wmrl.rl.selection import Selection
+from lerobot_wmrl.rl.selection import IMAGINED, REAL, Selection, best_checkpoint
 from lerobot_wmrl.rl.trained_policy import publish, summary
 from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 
@@ -86,6 +89,7 @@ def train_policy(cfg: TrainConfig) -> None:
     if done:
         if is_first_process():
             link_latest(cfg.output_dir)
+            link_best(cfg)
         print(f"{cfg.output_dir}: already trained for {cfg.iterations} iterations")
     else:
         set_seed(cfg.seed)
@@ -120,6 +124,15 @@ def finished(cfg: TrainConfig) -> bool:
     return not cfg.selection.freq or has_record(
         cfg.output_dir, Selection.name, cfg.iterations, cfg.iterations
     )
+
+
+def link_best(cfg: TrainConfig) -> None:
+    """Point `best` at the best checkpoint of a finished run: a kill may have come before that."""
+    if records := read_records(cfg.output_dir, Selection.name) if cfg.selection.freq else {}:
+        judge = REAL if REAL in records[cfg.iterations] else IMAGINED
+        refreshed = round_iterations(cfg.dyna.rounds, cfg.iterations)
+        best = best_checkpoint(cfg.output_dir, cfg.iterations, records, judge, refreshed)
+        link_checkpoint(best, BEST_CHECKPOINT_LINK)
 
 
 def train_in(env: TensorEnv, cfg: TrainConfig, claim: Claim, policy: LoadedPolicy) -> None:

@@ -249,6 +249,8 @@ def next_command(cfg: TrainWorldModelConfig) -> str:
     evaluate, world_model = "lerobot-wmrl-eval-world-model", folder / "action_world_model"
     if cfg.model.type == "frame_tokenizer":
         kind = ["--model.type=action_world_model", f"--model.tokenizer_path={cfg.output_dir}"]
+        learnt = {"dataset.more": cfg.dataset.more, "budget": cfg.budget}
+        kind += format_flags({name: value for name, value in learnt.items() if value})
         command, new = ["lerobot-wmrl-train-world-model", *cfg.typed_preset, *kind], world_model
     elif cfg.model.type == "text_world_model":
         models = [f"--model.path={world_model}", f"--text_model.path={cfg.output_dir}"]

@@ -11,6 +11,7 @@ from lerobot.utils.constants import OBS_STATE
 
 from lerobot_robot_imagined.config_imagined import ImaginedRobotConfig
 from lerobot_robot_imagined.keys import EpisodeKeys
+from lerobot_wmrl.common.actions import clip_actions, warn_of_clipped
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import to_pixels
 from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
@@ -46,6 +47,7 @@ class ImaginedRobot(Robot):
         self.keys: EpisodeKeys | None = None
         self.succeeded = False
         self.began: float | None = None
+        self.clipped: list[float] = []
 
     @property
     def cameras(self) -> dict[str, tuple[int, int, int]]:
@@ -98,7 +100,9 @@ class ImaginedRobot(Robot):
         )
 
     def disconnect(self) -> None:
-        """Forget the world model."""
+        """Forget the world model, and say how many actions were out of its range."""
+        warn_of_clipped(self.clipped)
+        self.clipped.clear()
         self.env = None
         if self.keys is not None:
             self.keys.close()
@@ -141,7 +145,8 @@ class ImaginedRobot(Robot):
                 f"use a teleoperator whose actions are {', '.join(names)}, or keyboard_ee or gamepad",
             )
         wanted = torch.tensor([[components[name] for name in names]], dtype=torch.float32)
-        self.last = wanted.clamp(self.env.action_low.cpu(), self.env.action_high.cpu())
+        self.last, share = clip_actions(wanted, self.env.action_low.cpu(), self.env.action_high.cpu())
+        self.clipped.append(float(share))
         if not self.succeeded:
             observation, _, terminated, _, info = self.env.step(self.last)
             self.observation = info.get("final_obs", observation)

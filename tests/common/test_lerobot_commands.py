@@ -8,6 +8,7 @@ import draccus
 import pytest
 from lerobot.scripts.lerobot_edit_dataset import EditDatasetConfig
 
+from lerobot_wmrl.common.hub import cached_repo
 from lerobot_wmrl.common.lerobot_commands import edit_advice
 
 
@@ -34,3 +35,8 @@ def test_a_copy_of_a_dataset_in_the_hubs_cache_is_not_made_there(tmp_path: Path)
     config = draccus.parse(EditDatasetConfig, args=flags)
     assert (str(config.root), config.repo_id) == (str(revision), "local/my_set")
     assert Path(config.new_root) == Path("data/my_set_edited")
+
+
+def test_a_folder_of_ones_own_is_not_taken_for_the_hubs_cache(tmp_path: Path) -> None:
+    assert cached_repo(tmp_path / "models--me--mine" / "snapshots" / "0123abc") == "models--me--mine"
+    assert cached_repo(tmp_path / "data" / "snapshots" / "run1") is None

@@ -148,6 +148,15 @@ def test_a_name_that_is_not_there_is_refused(published: LeRobotDataset) -> None:
         DatasetSource(repo_id=NAME, revision="v9").open()
 
 
+def test_a_revision_is_one_on_the_hub_and_no_whole_folder_is_replaced_by_it(
+    published: LeRobotDataset, caplog: pytest.LogCaptureFixture
+) -> None:
+    with pytest.raises(ValueError, match=r"dataset\.revision=v9: .* give `dataset\.repo_id`"):
+        DatasetSource(root=str(published.root), revision="v9").open()
+    assert DatasetSource(str(published.root), NAME, "v9").open().root == published.root
+    assert "holds a whole dataset, which is used as it is" in caplog.text
+
+
 @pytest.mark.parametrize("version", ["v2.1", "v2.0"])
 def test_an_older_format_is_refused_with_the_command_that_converts_it(
     version: str, published: LeRobotDataset, hub: Hub, tmp_path: Path

@@ -90,6 +90,11 @@ def test_episodes_begin_in_saved_frames_as_in_those_of_the_dataset(config, env, 
         np.savez(path, **{**whole, name: value})
         with pytest.raises(ValueError, match=rf"^dataset\.frames=.*needs {name} of shape \(6,"):
             saved.create_tensor_env(2)
+    np.savez(path, **{**whole, "task": np.array([text.encode() for text in whole["task"]])})
+    with pytest.raises(
+        ValueError, match=r"^dataset\.frames=.*task is \|S\d+, it must be text; save an array of"
+    ):
+        saved.create_tensor_env(2)
     np.savez(path, **{name: value[:0] for name, value in whole.items()})
     with pytest.raises(ValueError, match=rf"needs {IMAGE} of shape \('K', 32, 32, 3\), has \(0,"):
         saved.create_tensor_env(2)

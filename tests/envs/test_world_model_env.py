@@ -183,6 +183,17 @@ def test_lerobot_eval_says_how_many_actions_were_out_of_range(env, caplog):
     assert "50.0 % of the components" in caplog.text
 
 
+def test_lerobot_eval_says_that_episodes_begin_where_others_have(env, caplog):
+    adapter, count = EvaluationAdapter(env), len(env.starts)
+    adapter.reset(seed=list(range(B)))
+    adapter.reset(seed=list(range(B)))  # for another policy: the same seeds
+    assert "starts" not in caplog.text
+    for begin in range(B, count + 2 * B, B):
+        adapter.reset(seed=list(range(begin, begin + B)))
+    assert caplog.text.count(f"there are {count} starts for") == 1
+    assert f"Ask for {count} episodes" in caplog.text
+
+
 def test_actions_that_are_none_are_refused(env):
     """NaN would stay in an environment's state until its episode ends; one column would be taken for all."""
     env.reset(seed=1)

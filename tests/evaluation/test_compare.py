@@ -236,6 +236,15 @@ def test_a_comparison_that_stopped_continues_to_the_same_result(config, stop, tm
     assert {True, False} == {success for episode in whole["episodes"] for success in episode["successes"]}
 
 
+def test_a_comparison_that_stopped_ends_with_fewer_starts(config, monkeypatch):
+    """Its file says so too, though nothing is left to run."""
+    config.policies, config.n_episodes = config.policies[::2], 16
+    kill_in_third_block(config, monkeypatch)
+    assert not json.loads((config.output_dir / "comparison.json").read_text())["complete"]
+    config.n_episodes = 8
+    assert results_of(config)["complete"]
+
+
 def test_what_another_command_has_run_meanwhile_is_kept(config, monkeypatch):
     """It ended while this one made its environments."""
     whole = compare(replace(config)) or results_of(config)

@@ -292,9 +292,13 @@ def test_it_stands_still_after_a_success(make_robot):
     assert robot.get_observation()["tcp_x"] == still["tcp_x"]
 
 
-def test_actions_are_kept_within_their_range(make_robot):
-    sent = make_robot().send_action(dict.fromkeys(ACTION_NAMES, 5.0))
+def test_actions_are_kept_within_their_range_and_counted(make_robot, caplog):
+    robot = make_robot()
+    sent = robot.send_action(dict.fromkeys(ACTION_NAMES, 5.0))
     np.testing.assert_allclose(list(sent.values()), ACTION_HIGH, rtol=1e-6)
+    robot.send_action(sent)
+    robot.disconnect()
+    assert "50.0 % of the components of the actions were out of range" in caplog.text
 
 
 def test_a_keyboard_moves_it_and_its_gripper(make_robot):

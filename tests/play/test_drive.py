@@ -182,6 +182,26 @@ def test_every_driver_acts_and_the_recorded_one_as_recorded(world, saved, small_
     assert visit.answer({"do": "step", "driver": "planner"})["view"]["driver"] == "planner"
 
 
+def test_a_real_environment_that_has_moved_on_is_not_taken_for_that_of_the_drive(world, saved, monkeypatch):
+    """A drive that cannot begin may have begun a real episode."""
+    visit = Visit(world, saved)
+    visit.answer({"do": "begin", "episode": 0, "frame": 0})
+    assert visit.drive.synchronized
+    monkeypatch.setattr(world, "real_env", PushtEnv())
+    with pytest.raises(FieldError, match=r"^episode="):
+        visit.answer({"do": "begin", "episode": 99})
+    assert visit.drive.synchronized
+    monkeypatch.setattr(world, "make_real_env", object)
+    monkeypatch.setattr("lerobot_wmrl.play.world.RealEpisode", refuse)
+    with pytest.raises(FieldError, match=r"^seed=3"):
+        visit.answer({"do": "begin", "seed": 3})
+    assert not visit.drive.synchronized
+
+
+def refuse(kind: str, env: object, seed: int) -> None:
+    raise FieldError("seed", seed, "cannot be")
+
+
 def test_a_plan_is_made_anew_after_somebody_else_has_acted(world, saved):
     visit = Visit(world, saved)
     visit.answer({"do": "begin", "episode": 0, "frame": 0})

@@ -253,6 +253,13 @@ def test_labels_of_what_was_recorded_there_before_are_refused(rule, small_datase
         page_of(rule, open_dataset(tmp_path / "data"))
 
 
+def test_a_dataset_may_be_moved_while_it_is_labelled(rule, small_dataset, tmp_path):
+    shutil.copytree(small_dataset.root, tmp_path / "data")
+    page_of(rule, open_dataset(tmp_path / "data")).label(0, 1)
+    (tmp_path / "data").rename(tmp_path / "moved")
+    assert page_of(rule, open_dataset(tmp_path / "moved")).labels == {0: 1}
+
+
 @pytest.mark.parametrize(("episode", "first"), [("0", 500), ("6", 1), ("1", "2"), ("1", -1), ("1", True)])
 def test_a_label_in_the_file_that_cannot_be_is_named(rule, unlabelled, episode, first):
     page_of(rule, unlabelled).label(3, 2)

@@ -28,7 +28,7 @@ from torch import Tensor
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.checkpoints import model_folder
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, TrainingStopped
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.pipeline import action_unit, unchanged
 from lerobot_wmrl.common.policy_checks import require_distillable
@@ -153,7 +153,9 @@ def test_imagined_frames_are_kept_as_small_as_they_are_imagined(
     own = [*FAST, "--algorithm.recorded=true", f"--output_dir={tmp_path / 'distilled'}"]
     train(monkeypatch, *flags, *own)
     for file in (tmp_path / "distilled" / "labels").iterdir():
-        assert load_file(file)[IMAGE].shape[1:] == (3, 32, 32)
+        stored = load_file(file)
+        assert stored[IMAGE].shape[1:] == (3, 32, 32)
+        assert {*stored} == {IMAGE, "task", ACTION, "rows"}, "the policy has no input for the state"
     seen = []
     evaluate = CnnPolicy.evaluate
     monkeypatch.setattr(
@@ -532,16 +534,43 @@ def test_a_chunk_ends_with_its_run_and_repeats_the_last_action():
     assert action_windows(actions, labelled, None)["action"][:, 0].tolist() == [0, 1, 11, 2, 12, 13]
 
 
+def labels_of(iteration: int) -> ExpertLabelBatch:
+    """As many as twice the number of the iteration."""
+    count = 2 * iteration
+    part = {
+        "observation.images.top": torch.full((count, 3, 2, 2), 51 * iteration, dtype=torch.uint8),
+        "task": torch.zeros(count, dtype=torch.long),
+    }
+    actions = {"action": iteration + torch.arange(float(count))[:, None] / 10}
+    return ExpertLabelBatch(part, actions, torch.arange(count), [f"task {iteration}"])
+
+
+@pytest.mark.parametrize("damage", ["missing", "torn"])
+def test_labels_that_cannot_be_read_are_named(damage: str, tmp_path: Path) -> None:
+    labels = ExpertLabels(tmp_path, 0)
+    for iteration in range(2):
+        labels.add(iteration, labels_of(iteration))
+    labels.path(1).unlink() if damage == "missing" else labels.path(1).write_bytes(b"")
+    with pytest.raises(ValueError, match=r"000001-0\.safetensors: cannot be read .* iteration 2; restore it"):
+        ExpertLabels(tmp_path, 0).load(2)
+
+
+def test_labels_that_do_not_fit_into_memory_end_the_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    labels, size = ExpertLabels(tmp_path, 0), 4 * (12 + 8 + 4 + 8)  # images, task, action, row
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=size))
+    labels.add(0, labels_of(2))
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    with pytest.raises(TrainingStopped, match=r"^iteration 2: .*: lower `num_envs` or `iterations`"):
+        labels.add(1, labels_of(2))
+    assert len(labels) == 4
+
+
 def test_labels_are_the_same_when_they_are_read_again(tmp_path: Path):
     labels = ExpertLabels(tmp_path, 0)
-    for iteration in range(3):
-        count = 2 * iteration  # the first iteration has none
-        part = {
-            "observation.images.top": torch.full((count, 3, 2, 2), 51 * iteration, dtype=torch.uint8),
-            "task": torch.zeros(count, dtype=torch.long),
-        }
-        actions = {"action": iteration + torch.arange(float(count))[:, None] / 10}
-        labels.add(iteration, ExpertLabelBatch(part, actions, torch.arange(count), [f"task {iteration}"]))
+    for iteration in range(3):  # the first iteration has none
+        labels.add(iteration, labels_of(iteration))
     again = ExpertLabels(tmp_path, 0)
     again.load(3)
     assert len(again) == len(labels) == 6

@@ -15,6 +15,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from safetensors.torch import load_file
 
+from lerobot_wmrl.common.checkpoints import link_checkpoint
 from lerobot_wmrl.common.constants import START_SEED
 from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.seeds import GATE_SEED
@@ -108,6 +109,11 @@ def test_selection_keeps_the_best_checkpoint(improve: Any) -> None:
     written = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
     improve(*flags, "--selection.n_episodes=3")
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == written
+    best = (out / "checkpoints" / "best").resolve()
+    other = next(out / "checkpoints" / name for name in ("000001", "000002") if name != best.name)
+    link_checkpoint(other, "best")  # as a kill leaves it that comes before the last link
+    improve(*flags, "--selection.n_episodes=3")
+    assert (out / "checkpoints" / "best").resolve() == best
 
 
 def test_a_run_is_resumed_as_lerobot_train_resumes(improve: Any, paths: dict[str, Any]) -> None:
@@ -253,6 +259,11 @@ def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
         ),
         ([*POINT, "--dyna.rounds=1"], "no world model to refresh"),
         ([*POINT, "--selection.freq=-1"], "--selection.freq=-1: must be at least 0"),
+        ([*POINT, "--gate.dataset.root=D"], "--gate.dataset.root=D: is read in a world model alone"),
+        (
+            [*POINT, "--selection.dataset.root=D"],
+            "--selection.dataset.root=D: is read in a world model alone",
+        ),
         ([*POINT, "--resume=true"], "--resume=true: there is no checkpoint in"),
         (
             [*POINT, "--algorithm.clipp=0.3"],

@@ -3,11 +3,13 @@
 import json
 import math
 import re
+import shlex
 import shutil
 import sys
 from pathlib import Path
 from typing import Any
 
+import draccus
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -16,8 +18,10 @@ from lerobot_wmrl.common import precision
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.presets import PRESETS
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.scripts.train_world_model import main
+from lerobot_wmrl.data.dataset import TrainingData
+from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, main, next_command
 from lerobot_wmrl.world_models.checkpoint import config_to_continue, load_model, load_model_to_continue
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from tests.commands import run_here
 
 TRAINED = "checkpoints/last/pretrained_model"
@@ -263,6 +267,14 @@ def test_a_training_ends_with_what_it_made_how_good_it_is_and_what_comes_next(
     measured = json.loads((tmp_path / "action_world_model" / "held_out.json").read_text())
     assert f"On held-out episodes: loss {measured['loss']:.3f}, " in said
     assert f"lerobot-wmrl-eval-world-model --model.path={tmp_path / 'action_world_model'}" in said
+
+
+def test_what_comes_next_learns_from_the_same_data_under_the_same_budget(tmp_path: Path) -> None:
+    data, ledger = TrainingData("data", more=["new data", "newer"]), tmp_path / "ledger.json"
+    cfg = TrainWorldModelConfig(FrameTokenizerConfig(), data, budget=ledger, output_dir=Path("run"))
+    following = shlex.split(next_command(cfg))
+    again = draccus.parse(TrainWorldModelConfig, args=following[1:])
+    assert (again.dataset, again.budget, again.model.tokenizer_path) == (data, ledger, "run")
 
 
 def test_a_run_is_resumed_where_there_is_one(

@@ -490,6 +490,7 @@ async function copyLink() {
   if ("picture" in begun.place) throw new Error("a drive that begins in an uploaded picture has no link");
   const actions = views.slice(1, shown + 1).map((view) => view.action.map((each) => Number(each.toPrecision(9))));
   const url = new URL(location.href);
+  url.searchParams.delete("token"); // it admits whoever has the link; this browser has a cookie
   url.hash = encodeURIComponent(JSON.stringify({ place: begun.place, actions }));
   history.replaceState(null, "", url);
   await navigator.clipboard?.writeText(url.href).catch(() => {});
