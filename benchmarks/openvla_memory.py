@@ -25,7 +25,7 @@ from typing import Any
 
 import torch
 from accelerate import init_empty_weights
-from peft import LoraConfig, get_peft_model
+from peft import LoraConfig, PeftModel, get_peft_model
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 
@@ -76,7 +76,7 @@ class Policy(nn.Module):
         return ids
 
 
-def adapted(rank: int) -> nn.Module:
+def adapted(rank: int) -> PeftModel:
     """Make the policy on the meta device, without memory: its default adapters, all else frozen."""
     config = LoraConfig(r=rank, lora_alpha=rank // 2, **adapter_targets(RELEASED))
     with init_empty_weights():
@@ -213,7 +213,7 @@ def updates(rank: int, batch_sizes: Sequence[int], checkpointing: bool) -> list[
     return [{"batch": batch} | peak_and_rate(partial(update, batch), batch) for batch in batch_sizes]
 
 
-def on_gpu(policy: nn.Module) -> nn.Module:
+def on_gpu[P: nn.Module](policy: P) -> P:
     """Give every weight small random values on the default device."""
     for module in policy.modules():
         for name, weight in module._parameters.items():

@@ -33,7 +33,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.precision import keep_freed_memory
-from lerobot_wmrl.data.dataset import DatasetSource
+from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
 from lerobot_wmrl.play.saving import SavedEpisodes
@@ -205,7 +205,7 @@ def main() -> None:
         episode_length=10_000,
         done_frames=10_000,
     )
-    world = load_world(env, DatasetSource(given.root), None, None)
+    world = load_world(env, ChosenEpisodes(given.root), None, None)
     figures = {
         "threads": torch.get_num_threads(),
         "image_size": world.tokenizer_config.image_size,

@@ -87,8 +87,8 @@ def untrained_policy(env: gym.vector.VectorEnv, device: str) -> tuple[CnnPolicy,
         for name, shape in {ACTION: (size,), OBS_STATE: state}.items()
     }
     processors = make_cnn_pre_post_processors(config, stats)
-    shown = env.store_compact() if hasattr(env, "store_compact") else unchanged
-    return CnnPolicy(config).to(device).eval(), make_pipeline(config, *processors, shown=shown)
+    stretched = env.store_compact() if hasattr(env, "store_compact") else unchanged
+    return CnnPolicy(config).to(device).eval(), make_pipeline(config, *processors, shown=stretched)
 
 
 def buffer_bytes(buffer: RolloutBuffer) -> int:
@@ -154,10 +154,10 @@ def main() -> None:
     imagination = world_model_env(given, episode_length=given.steps, device=given.device)
     worlds: dict[str, tuple[Any, int]] = {"world_model": (imagination, given.num_envs)}
     if given.simulators:
-        model = read_config(given.world_model, "action_world_model")
+        tokenizer = read_config(given.world_model, "action_world_model").trained_tokenizer
         simulator = WmrlManiSkillEnv(
-            cameras=list(model.tokenizer.cameras),
-            image_size=model.tokenizer.image_size,
+            cameras=list(tokenizer.cameras),
+            image_size=tokenizer.image_size,
             episode_length=given.steps,
         )
         worlds["maniskill"] = (simulator, given.simulators)
