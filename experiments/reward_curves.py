@@ -90,7 +90,7 @@ def judged(
     parts = [env.step(action)[-1]["reward_parts"] for action in actions.unbind(1)]
     success = torch.stack([part["done_probability"] for part in parts], 1)
     similarity = torch.stack([part["similarity"] for part in parts], 1)
-    level = config.alpha * (success >= THRESHOLD).float() + (1 - config.alpha) * similarity
+    level = config.success_weight * (success >= THRESHOLD).float() + (1 - config.success_weight) * similarity
     learned = {name: torch.stack(values, 1) for name, values in probe.paid.items()}
     uncertainty = {signal: torch.stack([part[signal] for part in parts], 1) for signal in SIGNALS}
     every = {"general": level, "success": success, "similarity": similarity, **learned, **uncertainty}

@@ -263,6 +263,8 @@ def parsing_error(message: str, config_class: type[RunConfig]) -> str:
         group, reason = undecoded[1], refusal(undecoded[1], config_class) or undecoded[2]
     if inner := re.match(r"`([\w.]+)`: (.*)", reason, re.S):
         group, reason = ".".join(filter(None, (group, inner[1]))), inner[2]
+    if optional := re.fullmatch(r"Could not decode the value into any[^\n]*\n\s*\w+: ([^\n]*)\s*", reason):
+        reason = optional[1]  # of a setting that may be left out
     settings = list(settings_of(config_class, chosen_types(sys.argv[1:])))
     if "Expected a dict with a 'type' key" in reason:
         kinds = [each.name for each in settings if each.name.endswith(TYPE)]

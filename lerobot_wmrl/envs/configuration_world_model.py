@@ -1,6 +1,6 @@
 """Configuration of the world model as an environment, `--env.type=world_model`."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +136,9 @@ class WorldModelEnv(EnvConfig):
         self._check()
         if not self.world_model_path:
             return
+        if isinstance(self.reward, GeneralConfig) and self.reward.alpha is None:
+            alpha = self.reward.success_weight if self.text_world_model_path else 1.0
+            self.reward = replace(self.reward, alpha=alpha)
         if getattr(self.reward, "needs_goal", False) and not self.text_world_model_path:
             raise FieldError(
                 "text_world_model_path",
@@ -244,9 +247,7 @@ class WorldModelEnv(EnvConfig):
 
 @dataclass
 class DrivenEnv(WorldModelEnv):
-    """Imagined episodes that somebody drives: their reward is success, where the world model knows any."""
-
-    reward: RewardModelConfig = field(default_factory=lambda: GeneralConfig(alpha=1.0))
+    """Imagined episodes that somebody drives, also where the world model knows no success."""
 
     def _check_rewarding(self, model: Any) -> None:
         """Accept world models that know no success."""

@@ -53,7 +53,7 @@ def reward_along_episode(
         paid_once(probability, criterion),
         similarity[1:],
         similarity[:-1],
-        alpha=reward.alpha,
+        alpha=reward.success_weight,
         form=reward.form,
         gamma=potential_discount(reward, longest),
     )

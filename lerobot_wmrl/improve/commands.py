@@ -280,8 +280,6 @@ def imagination(progress: Progress) -> Flags:
         **{f"env.{name}": value for name, value in plan.data.flags().items()},
         "env.dataset.max_starts": MAX_STARTS,
         "env.dataset.branches": progress.learnt.branches(),
-        "env.reward.type": "general",
-        "env.reward.alpha": 1,
         "env.episode_length": plan.length,
         **{f"env.{name}": value for name, value in progress.criterion().items()},
     }

@@ -12,7 +12,7 @@ from lerobot.optim.optimizers import AdamWConfig
 
 from lerobot_wmrl.common.errors import require_at_least, require_choice, require_positive
 from lerobot_wmrl.common.images import camera_key
-from lerobot_wmrl.rewards.general import check_general_reward
+from lerobot_wmrl.rewards.general import DEFAULT_ALPHA, check_general_reward
 
 LPIPS_BACKBONES: Final = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
 SIMILARITIES: Final = ("tokenizer", *LPIPS_BACKBONES, "mse")
@@ -24,7 +24,8 @@ class GeneralConfig(RewardModelConfig):
     """The general reward (Algorithm 1): success, and similarity to an imagined goal frame.
 
     Args:
-        alpha: weight α of the sparse part (success); the dense part (similarity) has 1 − α.
+        alpha: weight α of the sparse part (success); the dense part (similarity) has 1 − α. By default 0.9,
+            and 1 in a world model without a text world model, which imagines the goal frame.
         form: `potential` pays for getting closer to the goal frame, `absolute` (as published) for being
             close.
         gamma: discount of the potential form, which should be PPO's; by default PPO's default, and 1 for
@@ -34,7 +35,7 @@ class GeneralConfig(RewardModelConfig):
             cache; `mse`, 1 − the mean squared error.
     """
 
-    alpha: float = 0.9
+    alpha: float | None = None
     form: str = "potential"
     gamma: float | None = None
     similarity: str = "tokenizer"
@@ -45,9 +46,14 @@ class GeneralConfig(RewardModelConfig):
         require_choice(self, "similarity", SIMILARITIES)
 
     @property
+    def success_weight(self) -> float:
+        """α, where none is given the default."""
+        return DEFAULT_ALPHA if self.alpha is None else self.alpha
+
+    @property
     def needs_goal(self) -> bool:
         """Whether there is a dense part, which needs goal frames."""
-        return self.alpha < 1
+        return self.success_weight < 1
 
 
 @dataclass

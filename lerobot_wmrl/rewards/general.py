@@ -21,6 +21,9 @@ hurries the policy, at costs that the world model may not see."""
 
 LARGEST_DISCOUNT: Final = 0.999
 
+DEFAULT_ALPHA: Final = 0.9
+"""Weight of success, where progress counts too."""
+
 
 def default_discount(longest: int) -> float:
     """Return the discount factor for episodes of up to `longest` steps, in thousandths."""
@@ -59,7 +62,9 @@ def general_reward[Number: (float, Tensor)](
 class GeneralRewardSettings(Protocol):
     """What the configurations of the general reward have in common, in imagination and in a simulator."""
 
-    alpha: float
+    @property
+    def alpha(self) -> float | None: ...
+
     form: str
     gamma: float | None
 
@@ -67,7 +72,8 @@ class GeneralRewardSettings(Protocol):
 def check_general_reward(settings: GeneralRewardSettings) -> None:
     """Raise FieldError for the first of the settings that is out of its range."""
     require_choice(settings, "form", FORMS)
-    require_share(settings, "alpha")
+    if settings.alpha is not None:
+        require_share(settings, "alpha")
     if settings.gamma is not None and not 0 < settings.gamma <= 1:
         raise FieldError("gamma", settings.gamma, "must be a discount above 0 and at most 1")
 
@@ -89,7 +95,7 @@ class RuleBasedReward:
             GRPO, which adds rewards up without one.
     """
 
-    alpha: float = 0.9
+    alpha: float = DEFAULT_ALPHA
     form: str = "potential"
     gamma: float | None = None
 

@@ -46,7 +46,7 @@ class GeneralRewardModel(PreTrainedRewardModel):
             batch["success"],
             batch["similarity"],
             batch["previous.similarity"],
-            alpha=config.alpha,
+            alpha=config.success_weight,
             form=config.form,
             gamma=gamma or 1.0,
         )

@@ -300,7 +300,6 @@ def policies_imagination(cfg: EvalWorldModelConfig, table: EpisodeTable) -> Worl
     with renamed("world_model_path", "model.path"):
         imagination = WorldModelEnv(
             world_model_path=cfg.model.path,
-            reward=GeneralConfig(alpha=1.0),
             device=cfg.device,
             episode_length=longest,
             dataset=starts,

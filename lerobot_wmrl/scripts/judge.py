@@ -68,7 +68,6 @@ from lerobot_wmrl.evaluation.policy_rollouts import (
     read_policies,
     run_block,
 )
-from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 
 @dataclass
@@ -167,7 +166,6 @@ class JudgeConfig(RunConfig):
             return WorldModelEnv(
                 world_model_path=self.world_model.path,
                 dataset=starts,
-                reward=GeneralConfig(alpha=1.0),
                 episode_length=self.episode_length,
                 done_threshold=self.done_threshold,
                 done_frames=self.done_frames,

@@ -43,7 +43,6 @@ from lerobot_wmrl.common.policies import check_weights, read_policy_config
 from lerobot_wmrl.common.policy_checks import require_trained
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.play.checks import LAST_PORT, whole_number
-from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 if TYPE_CHECKING:
     from lerobot_wmrl.play.world import World
@@ -154,7 +153,6 @@ def play(cfg: PlayConfig) -> None:
     from lerobot_wmrl.play.world import load_world
 
     cfg.validate()
-    reward = {"reward": GeneralConfig()} if cfg.text_world_model.path else {}
     with (
         renamed("world_model_path", "world_model.path"),
         renamed("text_world_model_path", "text_world_model.path"),
@@ -166,7 +164,6 @@ def play(cfg: PlayConfig) -> None:
             done_threshold=cfg.done_threshold,
             done_frames=cfg.done_frames,
             device=cfg.device if cfg.export is None else "cpu",
-            **reward,
         )
         world = load_world(env, cfg.dataset, cfg.policy, cfg.real_env, cfg.end_at_success)
     if cfg.export is not None:

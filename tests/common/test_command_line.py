@@ -131,6 +131,10 @@ def test_a_flag_that_does_not_exist_leads_to_one_that_does(name: str, near: str 
             ["--env.type=world_model", "--env.reward.type=general", "--env.reward.alpha=x"],
             "--env.reward.alpha: Couldn't parse 'x' into a float",
         ),
+        (
+            ["--env.type=world_model", "--env.episode_length=x"],
+            "error: --env.episode_length: Couldn't parse 'x' into an int",
+        ),
         (["--iterations=many"], "--iterations: Couldn't parse 'many' into an int"),
     ],
 )

@@ -326,6 +326,16 @@ def test_compact_frames_become_those_that_a_policy_sees(config):
         assert torch.equal(full[IMAGE], stored[IMAGE])
 
 
+def test_success_alone_is_rewarded_where_nothing_imagines_a_goal(trained_models):
+    path, text = (str(trained_models[kind]) for kind in ("action_world_model", "text_world_model"))
+    assert WorldModelEnv(world_model_path=path).reward.alpha == 1
+    assert WorldModelEnv(world_model_path=path, text_world_model_path=text).reward.alpha == 0.9
+    given = GeneralConfig(alpha=0.5)
+    assert WorldModelEnv(world_model_path=path, text_world_model_path=text, reward=given).reward.alpha == 0.5
+    with pytest.raises(ValueError, match=r"^text_world_model_path=: .* or set `reward\.alpha` to 1"):
+        WorldModelEnv(world_model_path=path, reward=given)
+
+
 def test_episodes_last_as_long_as_the_world_model_has_learnt(config, trained_models, caplog):
     path = str(trained_models["action_world_model"])
     by_default = replace(config, episode_length=None)

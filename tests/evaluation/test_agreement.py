@@ -20,7 +20,6 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelE
 from lerobot_wmrl.evaluation.agreement import Agreement, policy_checkpoints
 from lerobot_wmrl.evaluation.policy_rollouts import StepCounter, evaluate_policy
 from lerobot_wmrl.evaluation.report import agreement_table
-from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.eval_world_model import (
     EvalWorldModelConfig,
     checked_policies,
@@ -38,7 +37,6 @@ def imagination(small_dataset, trained_models) -> WorldModelEnv:
     return WorldModelEnv(
         world_model_path=str(trained_models["action_world_model"]),
         dataset=StartFrames(root=str(Path(small_dataset.root))),
-        reward=GeneralConfig(alpha=1.0),
         done_threshold=0.0001,
         done_frames=1,
         episode_length=4,

@@ -214,7 +214,7 @@ def test_what_a_policy_does_out_of_range_is_reported(config, tmp_path, caplog):
 
     far = acting("far", 1.5 * np.array(ACTION_HIGH))
     record(replace(config, output_dir=tmp_path / "clipped", policy=far))
-    assert "100.0 % of the components of the policy's actions were out of range" in caplog.text
+    assert "100.0 % of the components of the actions were out of range" in caplog.text
     other = replace(
         config, output_dir=tmp_path / "refused", policy=acting("units", 9 * np.array(ACTION_HIGH))
     )

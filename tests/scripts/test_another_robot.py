@@ -81,7 +81,6 @@ def imagination(world_model: Path, episodes: Path) -> list[str]:
         f"--env.dataset.root={episodes}",
         "--env.episode_length=6",
         "--env.reward.type=general",
-        "--env.reward.alpha=1",
         "--gate.action=off",
     ]
 
