@@ -158,12 +158,18 @@ class RecordConfig(RunConfig):
                 self.seed,
                 f"the seeds of planned trajectories are from 0 to {EVALUATION_SEED - 1}, those above are for "
                 "evaluation",
+                "choose a smaller one",
             )
         if not 0 <= self.exploration <= 1 or (self.exploration and self.policy is None):
             problem = "must be a share of the action box, 0 to 1, for a policy's rollouts only"
             raise FieldError("exploration", self.exploration, problem, "give `policy.path`, or leave it out")
         if self.shard_of[1] > -(-self.num_episodes // self.part_episodes):
-            raise FieldError("shard", self.shard, "there are fewer sub-datasets than shards")
+            raise FieldError(
+                "shard",
+                self.shard,
+                "there are fewer sub-datasets than shards",
+                "take fewer shards, or lower `part_episodes`",
+            )
         require_choice(self, "planner", MOTIONS)
         if isinstance(self.env, WmrlManiSkillEnv) and self.env.batched:
             raise FieldError(
@@ -223,7 +229,7 @@ class RecordConfig(RunConfig):
         unknown = [kind for kind in self.kinds if kind not in planned]
         if unknown or min(self.kinds.values(), default=0) < 0 or sum(self.kinds.values()) <= 0:
             problem = f"must be shares of {', '.join(planned)}, at least one above 0"
-            raise FieldError("kinds", self.kinds, problem)
+            raise FieldError("kinds", self.kinds, problem, "name some of these, as in {optimal: 1}")
 
     def _validate_publishing(self) -> None:
         """Raise FieldError, before anything is recorded, if the name or the hub's token is missing."""

@@ -13,8 +13,8 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene, scene_for_seed
 
 MOST_VISITS = 1000
-"""Imagined episodes of one recording that begin in the same start, at most: recordings with other seeds have
-other random numbers."""
+"""Imagined episodes of one recording from the same start up to which recordings with other seeds have other
+random numbers."""
 
 
 @dataclass(frozen=True)

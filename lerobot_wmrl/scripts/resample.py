@@ -61,7 +61,8 @@ def resample(cfg: ResampleConfig) -> None:
     """Write the copy and say what is in it."""
     dataset = cfg.dataset.open()
     table = read_episodes(dataset)
-    summed = summed_components(cfg, dataset)
+    check(cfg, dataset)
+    summed = np.isin(component_names(dataset.features[ACTION]), cfg.displacements)
     if absolute_control(table) is False and not summed.any():
         logging.warning(
             "the actions do not follow the state: if they are displacements, name the components that add up "
@@ -81,8 +82,8 @@ def resample(cfg: ResampleConfig) -> None:
     print("\n".join(lines))
 
 
-def summed_components(cfg: ResampleConfig, dataset: LeRobotDataset) -> np.ndarray:
-    """Mark the components of the action that add up. FieldError for a setting that cannot be. (A,)"""
+def check(cfg: ResampleConfig, dataset: LeRobotDataset) -> None:
+    """Raise FieldError for a setting that cannot be, or a dataset that cannot be copied whole."""
     require_at_least(cfg, 2, "every")
     if dataset.fps % cfg.every:
         raise FieldError(
@@ -117,11 +118,13 @@ def summed_components(cfg: ResampleConfig, dataset: LeRobotDataset) -> np.ndarra
             + edit_advice(dataset.root, "remove_feature", {"operation.feature_names": language}),
         )
     require_new("output_dir", cfg.output_dir)
-    return np.isin(names, cfg.displacements)
 
 
 def write_resampled(dataset: LeRobotDataset, cfg: ResampleConfig, summed: np.ndarray) -> None:
-    """Copy the frames that are kept with LeRobot's own functions; the folder is whole or absent."""
+    """Copy the frames that are kept with LeRobot's own functions; the folder is whole or absent.
+
+    summed: components of the action that add up, (A,).
+    """
     from tqdm import trange
 
     try:

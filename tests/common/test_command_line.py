@@ -133,7 +133,7 @@ def test_a_flag_that_does_not_exist_leads_to_one_that_does(name: str, near: str 
         ),
         (
             ["--env.type=world_model", "--env.episode_length=x"],
-            "error: --env.episode_length: Couldn't parse 'x' into an int",
+            "--env.episode_length: Couldn't parse 'x' into an int",
         ),
         (["--iterations=many"], "--iterations: Couldn't parse 'many' into an int"),
     ],
