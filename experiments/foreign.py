@@ -30,7 +30,7 @@ TIMED: Final = ("data", "cloned", "improve", "longer", "comparison")
 
 
 def metaworld(study: Study) -> Results:
-    """Return the success of the three policies on the same starts, and the minutes of each step."""
+    """Return the success of the policies on the same starts, and the minutes of each step."""
     comparison: dict[str, Any] = json.loads((study.folder / "comparison" / COMPARISON_FILE).read_text())
     outcomes = zip(*(episode["successes"] for episode in comparison["episodes"]), strict=True)
     gate = study.folder / "improve" / "check" / "metrics.json"
@@ -44,7 +44,7 @@ def metaworld(study: Study) -> Results:
 
 
 def section(load: Load) -> str:
-    """Return the section: success of the three policies, seed by seed, and the mean gains."""
+    """Return the section: success of the policies, seed by seed, and the mean gains."""
     variables = [each.variables for each in read_cells(ROOT / "experiments" / "metaworld.yaml")]
     cells = [cell for each in variables if (cell := published(load, "metaworld", each["cell"]))]
     rows: list[list[Any]] = []
@@ -68,7 +68,7 @@ successes, on the same starts:
 
 {minutes_of(cells)} An episode of LeRobot's environment has up to 500 steps. The interval of a mean
 draws seeds and starts. Everything ran by the commands that the documentation has for any data; no line of
-code knows Meta-World but the [script that records it](../examples/record_metaworld.py), which uses LeRobot
+code knows Meta-World but the [script that records it](../examples/metaworld/record.py), which uses LeRobot
 alone."""
 
 

@@ -33,6 +33,8 @@ from lerobot_wmrl.common.files import write_json
 
 RECORDS: Final = "steps"
 PROVENANCE: Final = "provenance"
+RUNNING: Final = "running"
+"""A file in the folder of a study that is not finished."""
 
 
 def run_study(study: Study, repeat: bool = False) -> None:
@@ -48,10 +50,24 @@ def run_study(study: Study, repeat: bool = False) -> None:
                 f"needs {name}, of which {folder} holds nothing: run experiments/{name}.yaml first, or give "
                 f"{name}=FOLDER"
             )
+        if (folder / RUNNING).exists():
+            raise StudyError(
+                f"needs {name}, and {folder} is not finished: run experiments/{name}.yaml to its end first"
+            )
     budget.begin(study)
+    (study.folder / RECORDS).mkdir(parents=True, exist_ok=True)
+    (study.folder / RUNNING).touch()
     for number, step in enumerate(study.steps, start=1):
         heading = f"[{number}/{len(study.steps)}] {step.name}"
         record = read_record(study.folder, step.name)
+        later = study.steps[number:]
+        if record is None and any(read_record(study.folder, each.name) for each in later):
+            if not repeat:
+                raise StudyError(
+                    f"{step.name} is not finished, but steps after it are, without what it makes now. Give "
+                    "--repeat to run them again too, or another output_dir=FOLDER."
+                )
+            forget(study, later)
         if record is None:
             run_step(study, step, heading)
         elif record["command"] == step.command:
@@ -66,6 +82,7 @@ def run_study(study: Study, repeat: bool = False) -> None:
                 f"  now:  {step.command}\nGive --repeat to run it and all steps after it again, or another "
                 "output_dir=FOLDER."
             )
+    (study.folder / RUNNING).unlink()
 
 
 def run_step(study: Study, step: Step, heading: str) -> None:
@@ -76,13 +93,13 @@ def run_step(study: Study, step: Step, heading: str) -> None:
     print(f"\n{heading}\n$ {step.command}", flush=True)
     commands = Path(sys.executable).parent
     environment = {**os.environ, "PATH": f"{commands}{os.pathsep}{os.environ['PATH']}"}
-    began = time.monotonic()
+    began, ran = time.monotonic(), commit()
     status = subprocess.run(["bash", "-euo", "pipefail", "-c", step.command], env=environment).returncode
     if status != 0:
         raise StudyError(f"{step.name}: exit status {status}. Run the study again to continue here.")
     budget.check_datasets(study, step, checked)
     seconds = round(time.monotonic() - began, 1)
-    finished = {"command": step.command, "seconds": seconds, "commit": commit(), "machine": machine()}
+    finished = {"command": step.command, "seconds": seconds, "commit": ran, "machine": machine()}
     write_json(record_path(study.folder, step.name), finished)
 
 
@@ -156,8 +173,15 @@ def provenance(study: Study) -> dict[str, Any]:
         "study": study.name,
         "commit": ", ".join(dict.fromkeys(record["commit"] for record in records)),
         "machine": "; ".join(dict.fromkeys(record["machine"] for record in records)),
+        "needs": {name: commits_of(folder) for name, folder in study.needs.items()},
         "commands": {step.name: step.command for step in study.steps},
     }
+
+
+def commits_of(folder: Path) -> str:
+    """Return the commits of the code that has run a study, by its folder."""
+    records = (json.loads(path.read_text()) for path in sorted((folder / RECORDS).glob("*.json")))
+    return ", ".join(dict.fromkeys(record["commit"] for record in records))
 
 
 def commit() -> str:

@@ -199,7 +199,8 @@ def quoted_for_yaml(value: str, kind: str) -> str:
         read = ...
     if kind in TEXTS:
         quoted = isinstance(read, str) and value[0] in QUOTATION_MARKS
-        return value if read in (None, value) or quoted else json.dumps(value, ensure_ascii=False)
+        none = read is None and "#" not in value  # a comment, which YAML reads as nothing too
+        return value if none or read == value or quoted else json.dumps(value, ensure_ascii=False)
     listed = kind.startswith("list[") and kind[5:-1] in TEXTS and isinstance(read, list)
     if listed and not all(isinstance(each, str) for each in read):
         return format_value(yaml.load(value, yaml.BaseLoader))

@@ -29,6 +29,7 @@ import torch
 from lerobot.configs import parser
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
+from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.lerobot_commands import whole_checkpoint
 from lerobot_wmrl.common.precision import keep_freed_memory
@@ -149,6 +150,8 @@ def run_stage(stage: Stage, heading: str, output_dir: Path, record: dict[str, An
         save(record["seconds"] - seconds, record["peak_memory_bytes"])
         print(f"{stage.title}: exit status {status}. Its output is in {log}; the others go on.", flush=True)
         return
+    if status == STOPPED:  # it would stop again
+        raise StageError(f"{stage.title}: {last_line(log).removeprefix('stopped: ')}")
     if status != 0:
         raise StageError(
             f"{stage.title}: exit status {status}. Its output is in {log}; run the same command again to "

@@ -32,7 +32,7 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, env.num_envs)
         self._max_episode_steps = self.env.max_episode_steps
         self._clipped: list[float] = []
-        self._seeds = set[int]()
+        self._seeds, self._repeats = set[int](), False
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -66,17 +66,18 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         return self._to_numpy(self._last), reward.cpu().numpy(), *flags, result
 
     def _count_starts(self, seeds: Sequence[int]) -> None:
-        """Warn, once, of a world model's episodes that begin where another one has begun."""
+        """Warn, once, of a world model's episodes that begin where another one has begun. LeRobot fills the
+        last batch up with episodes that it does not count."""
         starts = len(getattr(self.env, "starts", ())) or math.inf
-        before = len(self._seeds)
+        begun = len(self._seeds)
         self._seeds.update(seeds)
-        if before <= starts < len(self._seeds):
+        if begun >= starts and len(self._seeds) > begun and not self._repeats:
+            self._repeats = True
             logging.warning(
-                "there are %d starts for %d episodes or more: from the same start a policy that draws no "
+                "there are %d starts for more episodes: from the same start a policy that draws no "
                 "actions does the same again, which says nothing new. Ask for %d episodes, or give more "
                 "starts (env.dataset)",
                 starts,
-                len(self._seeds),
                 starts,
             )
 

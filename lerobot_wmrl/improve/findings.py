@@ -154,12 +154,21 @@ def inspect_dataset(
     """
     chosen = table.among(episodes)
     held_out, total = table.success[table.validation & chosen], len(chosen)
+    learnt = table.success[table.training(episodes)]
     table = table.subset(chosen)
     features, success = table.dataset.features, table.success
     keys = [key for key in policy.image_features if key.startswith(OBS_IMAGE)]
     sizes = {key: frame_size(features[key]) for key in keys if key in features}
     state = {OBS_STATE: tuple(features[OBS_STATE]["shape"])} if OBS_STATE in features else {}
     require_improvable(table, policy, {key: (3, *size) for key, size in sizes.items()} | state)
+    if not rollouts and not learnt.any():
+        raise FieldError(
+            "dataset.root",
+            table.dataset.root,
+            f"its {success.sum()} successful episodes are all held out from training, as every twentieth "
+            "episode is, so there is nothing to learn success from",
+            "record or label more successes",
+        )
     tasks = np.unique(table.column(START_TASK), return_counts=True)[1]
     done = [table.success_target[rows].sum() for rows in table.rows(range(len(success)))]
     return Findings(

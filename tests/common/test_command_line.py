@@ -233,6 +233,8 @@ def test_a_setting_that_another_version_lacks_is_off_there():
         "1.10",
         "1e3",
         "a #b",
+        "#3 run",
+        "#",
         "yes",
         "a: b",
         "plain",

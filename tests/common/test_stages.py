@@ -14,7 +14,7 @@ import pytest
 from lerobot.configs import parser
 
 from lerobot_wmrl.common import stages as runner
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import STOPPED, FieldError
 from lerobot_wmrl.common.lerobot_commands import edit_command, train_command
 from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.common.stages import (
@@ -53,8 +53,8 @@ def appending(name: str, file: Path) -> Stage:
 
 
 def test_finished_stages_are_not_repeated_and_a_failed_one_is(tmp_path: Path) -> None:
-    file, fails = tmp_path / "ran", python("b", "raise SystemExit(3)")
-    with pytest.raises(StageError, match=r"exit status 3.*b\.log"):
+    file, fails = tmp_path / "ran", python("b", "raise SystemExit(4)")
+    with pytest.raises(StageError, match=r"exit status 4.*b\.log"):
         run_stages([appending("a", file), fails, appending("c", file)], tmp_path)
     assert file.read_text() == "a"
     run_stages([appending("a", file), appending("b", file), appending("c", file)], tmp_path)
@@ -65,11 +65,11 @@ def test_after_an_optional_stage_that_fails_the_others_go_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Also by a second call, whose later stages may build on there being nothing."""
-    file, fails = tmp_path / "ran", replace(python("b", "raise SystemExit(3)"), optional=lambda status: True)
+    file, fails = tmp_path / "ran", replace(python("b", "raise SystemExit(4)"), optional=lambda status: True)
     stages = [appending("a", file), fails, appending("c", file)]
     run_stages(stages, tmp_path)
     assert file.read_text() == "ac"
-    assert f"b: exit status 3. Its output is in {tmp_path / 'logs' / 'b.log'}; the others go on" in (
+    assert f"b: exit status 4. Its output is in {tmp_path / 'logs' / 'b.log'}; the others go on" in (
         capsys.readouterr().out
     )
     record = read_record(tmp_path, "b")
@@ -81,7 +81,7 @@ def test_after_an_optional_stage_that_fails_the_others_go_on(
 
 
 def test_an_optional_stage_is_tried_again_before_others_build_on_its_failure(tmp_path: Path) -> None:
-    file, fails = tmp_path / "ran", replace(python("b", "raise SystemExit(3)"), optional=lambda status: True)
+    file, fails = tmp_path / "ran", replace(python("b", "raise SystemExit(4)"), optional=lambda status: True)
     run_stages([fails], tmp_path)
     run_stages([replace(appending("b", file), optional=lambda status: True), appending("c", file)], tmp_path)
     assert file.read_text() == "bc"
@@ -91,12 +91,18 @@ def test_an_optional_stage_is_tried_again_before_others_build_on_its_failure(tmp
 def test_a_stage_may_say_only_when_it_fails_that_it_is_optional(tmp_path: Path) -> None:
     """As one that leaves something to go on with, or not."""
     left, file = tmp_path / "left", tmp_path / "ran"
-    fails = replace(python("a", "raise SystemExit(3)"), optional=lambda status: status == 3 and left.exists())
-    with pytest.raises(StageError, match="exit status 3"):
+    fails = replace(python("a", "raise SystemExit(4)"), optional=lambda status: status == 4 and left.exists())
+    with pytest.raises(StageError, match="exit status 4"):
         run_stages([fails, appending("b", file)], tmp_path)
     left.touch()
     run_stages([fails, appending("b", file)], tmp_path)
     assert file.read_text() == "b"
+
+
+def test_a_stage_that_stops_by_a_rule_of_its_own_is_not_to_be_run_again(tmp_path: Path) -> None:
+    stops = python("b", f"import sys; print('stopped: nothing was rewarded'); sys.exit({STOPPED})")
+    with pytest.raises(StageError, match=r"^b: nothing was rewarded$"):
+        run_stages([stops], tmp_path)
 
 
 def test_an_optional_stage_that_was_killed_has_not_failed(tmp_path: Path) -> None:

@@ -109,6 +109,36 @@ def test_an_interrupted_repetition_is_repeated(study_file: Path, monkeypatch: py
     assert (changed.folder / "b" / "said").read_text().startswith("two")
 
 
+def test_a_step_that_is_missing_is_not_put_before_what_was_made_without_it(study_file: Path) -> None:
+    study_file.write_text(TWO)
+    study = read(study_file)
+    run_study(study)
+    (study.folder / "steps" / "a.json").unlink()
+    with pytest.raises(StudyError, match=r"^a is not finished, but steps after it are"):
+        run_study(study)
+    (study.folder / "b" / "said").unlink()
+    run_study(study, repeat=True)
+    assert (study.folder / "b" / "said").is_file()
+
+
+def test_a_study_that_is_not_finished_is_no_ground_for_another(study_file: Path) -> None:
+    needed = study_file.with_name("needed.yaml")
+    needed.write_text(COUNT.replace('echo \'{"n"', 'false && echo \'{"n"'))
+    study_file.write_text("needs: [needed]\n" + COUNT)
+    folder = study_file.parent / "made"
+    study = read(study_file, f"needed={folder}")
+    with pytest.raises(StudyError, match="exit status 1"):
+        run_study(read(needed, f"output_dir={folder}"))
+    with pytest.raises(StudyError, match=rf"^needs needed, and {folder} is not finished"):
+        run_study(study)
+    needed.write_text(COUNT)
+    run_study(read(needed, f"output_dir={folder}"), repeat=True)
+    run_study(study)
+    publish(study, study_file.parent / "docs")
+    source = json.loads((study_file.parent / "docs/results/count.json").read_text())["provenance"]
+    assert source["needs"] == {"needed": source["commit"]}
+
+
 def test_results_are_published_with_commit_machine_and_commands(study_file: Path) -> None:
     study = read(study_file)
     run_study(study)

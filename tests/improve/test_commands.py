@@ -17,16 +17,17 @@ from lerobot.scripts.lerobot_edit_dataset import EditDatasetConfig
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_wmrl.common.checkpoints import link_checkpoint
-from lerobot_wmrl.common.errors import STOPPED
+from lerobot_wmrl.common.errors import STOPPED, FieldError
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.output_folders import Claim
+from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.stages import MARKER
 from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve import commands, learnt
-from lerobot_wmrl.improve.findings import few_decisions, one_sided_tasks, usual_length
+from lerobot_wmrl.improve.findings import few_decisions, inspect_dataset, one_sided_tasks, usual_length
 from lerobot_wmrl.improve.plan import Plan
 from lerobot_wmrl.improve.progress import CLONED, DISTILLED, FITTED, PPO, SFT, Progress
 from lerobot_wmrl.improve.report.words import reservations
@@ -36,6 +37,7 @@ from lerobot_wmrl.scripts.improve import settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
 from tests.improve.made_up import commands_of, improvement_of, made_commands
+from tests.relabelled import relabelled
 from tests.rl.checkpoints import save_untrained_policy
 
 
@@ -175,6 +177,18 @@ def test_imagined_comparisons_begin_in_all_parts_of_a_dataset(
 ) -> None:
     """Not in neighbouring episodes, which may be of one task, or of demonstrations alone."""
     assert f"--env.dataset.max_starts={taken}" in made_commands(tmp_path, **found)["comparison"]
+
+
+def test_successes_that_are_all_held_out_are_not_enough(make_synthetic_dataset: Any, tmp_path: Path) -> None:
+    """Unless rollouts, which are recorded too, bring others."""
+    root = Path(make_synthetic_dataset(tmp_path / "data", episodes=20).root)
+    episode = np.asarray(read_episodes(open_dataset(root)).dataset.hf_dataset["episode_index"])
+    relabelled(root, tmp_path / "last", {"next.success": (episode == 19).tolist()})
+    table = read_episodes(open_dataset(tmp_path / "last"))
+    policy = read_policy_config(str(save_untrained_policy(tmp_path / "policy", actions=7)), [])
+    with pytest.raises(FieldError, match="its 1 successful episodes are all held out from training"):
+        inspect_dataset(table, policy, None)
+    assert inspect_dataset(table, policy, None, rollouts=9).total == 20
 
 
 @pytest.mark.parametrize(("held_out", "split"), [(0, "all"), (9, "all"), (10, "validation")])
