@@ -111,6 +111,12 @@ def is_file(path: str | None) -> bool:
     return path is not None and Path(path).is_file()
 
 
+@cache
+def register_plugins() -> None:
+    """Register every installed plugin of LeRobot, once."""
+    register_third_party_plugins()
+
+
 def run_command[Config: RunConfig](
     function: Callable[[Config], None],
     config_class: type[Config],
@@ -124,7 +130,7 @@ def run_command[Config: RunConfig](
         config_class: class of its settings.
         expand: replaces the flags that stand for others (`--preset`).
     """
-    register_third_party_plugins()
+    register_plugins()
     init_logging()
     logging.getLogger("lerobot.configs").setLevel(logging.ERROR)
     try:

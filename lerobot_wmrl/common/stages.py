@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -28,7 +29,7 @@ import psutil
 import torch
 from lerobot.configs import parser
 
-from lerobot_wmrl.common.command_line import RunConfig, run_command
+from lerobot_wmrl.common.command_line import RunConfig, parsed_quickly, run_command
 from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.lerobot_commands import whole_checkpoint
@@ -255,7 +256,8 @@ def _run_command(command: list[str], output: int, parent: int, anew: bool) -> No
     sys.argv = command
     for remembered in (parser._config_path_args, parser._config_yaml_overrides):
         remembered.clear()  # of this program's --config_path, which LeRobot ranks above a command's flags
-    sys.exit(entry_point(command[0])())
+    with nullcontext() if {"--help", "-h"} & {*command} else parsed_quickly():
+        sys.exit(entry_point(command[0])())
 
 
 def _follow(process: BaseProcess, output: int, log: BinaryIO, progress: Progress) -> None:

@@ -2,6 +2,7 @@
 decided who is better."""
 
 import logging
+import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from math import ceil
@@ -112,6 +113,8 @@ def opened(config: EnvConfig, n_envs: int, trust_remote_code: bool, policies: in
     process: all of them are open at the same time.
     """
     shared, parallel = is_own(config), runs_in_processes(config)
+    if parallel and not shared:  # each process would import it anew
+        multiprocessing.get_context("forkserver").set_forkserver_preload(["lerobot.envs.utils"])
 
     def make() -> Envs:
         envs: Envs = make_env(config, n_envs, parallel, trust_remote_code=trust_remote_code)

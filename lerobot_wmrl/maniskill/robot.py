@@ -1,5 +1,6 @@
 """The robot: ManiSkill's Panda, commanded by pose deltas in metres and radians along the base's axes."""
 
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -89,23 +90,28 @@ class InverseKinematics:
         return qpos
 
 
+DECIMATED: dict[tuple[bytes, float], tuple[np.ndarray, ...]] = {}
+"""Decimated meshes by a digest of the full one, and the share of its triangles: robots share them, also those
+of the next simulator in this process."""
+
+
 def lighten_meshes(robot: Any, detail: float) -> None:
     """Replace the robot's visual meshes by decimated ones with the share `detail` of their triangles.
 
     Software rendering is bound by vertices: 4 % of the triangles draw several times faster and look the same
     at 64 and 128 px.
     """
-    known: dict[tuple[str, int, int], tuple[np.ndarray, ...]] = {}  # robots beside each other share meshes
     for name, body in _render_bodies(robot):
         share = min(1.0, 3.0 * detail) if name in FINE_LINKS else detail
         light = sapien.render.RenderBodyComponent()
-        for which, shape in enumerate(body.render_shapes):
-            for number, part in enumerate(shape.parts):
+        for shape in body.render_shapes:
+            for part in shape.parts:
                 if len(part.triangles):
-                    key = (name, which, number)
-                    if key not in known:
-                        known[key] = _decimated(part, share)
-                    mesh = sapien.render.RenderShapeTriangleMesh(*known[key], part.material)
+                    vertices, triangles = (np.asarray(each) for each in (part.vertices, part.triangles))
+                    key = hashlib.sha256(b"".join((vertices.tobytes(), triangles.tobytes()))).digest(), share
+                    if key not in DECIMATED:
+                        DECIMATED[key] = _decimated(vertices, triangles, share)
+                    mesh = sapien.render.RenderShapeTriangleMesh(*DECIMATED[key], part.material)
                     mesh.local_pose = shape.local_pose
                     light.attach(mesh)
         entity = body.entity
@@ -121,14 +127,14 @@ def _render_bodies(robot: Any) -> Iterator[tuple[str, Any]]:
                 yield link.name, component
 
 
-def _decimated(part: Any, share: float) -> tuple[np.ndarray, ...]:
-    """Return a mesh part with `share` of its triangles, at least `FEWEST_TRIANGLES`.
+def _decimated(vertices: np.ndarray, triangles: np.ndarray, share: float) -> tuple[np.ndarray, ...]:
+    """Return a mesh with `share` of its triangles, at least `FEWEST_TRIANGLES`.
 
     Returns:
         Vertices (V, 3), triangles (F, 3), normals (V, 3), and an empty array for texture coordinates.
     """
-    vertices, inverse = np.unique(np.asarray(part.vertices, np.float32).round(5), axis=0, return_inverse=True)
-    triangles = inverse.reshape(-1)[np.asarray(part.triangles)].astype(np.int32)
+    vertices, inverse = np.unique(vertices.astype(np.float32).round(5), axis=0, return_inverse=True)
+    triangles = inverse.reshape(-1)[triangles].astype(np.int32)
     reduction = 1.0 - max(FEWEST_TRIANGLES, share * len(triangles)) / len(triangles)
     if reduction > 0:
         vertices, triangles = fast_simplification.simplify(vertices, triangles, reduction)

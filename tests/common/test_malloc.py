@@ -5,7 +5,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 PROBE = """
-import ctypes, os, platform
+import ctypes, os, platform, sys, types
+
+package = types.ModuleType("lerobot_wmrl")  # without LeRobot, whose import takes seconds
+package.__path__ = ["lerobot_wmrl"]
+sys.modules["lerobot_wmrl"] = package
 from lerobot_wmrl.common.precision import MALLOC_SETTINGS, keep_freed_memory
 
 keep_freed_memory()

@@ -17,7 +17,6 @@ from lerobot_wmrl.envs.configuration_hub import HubEnv
 from lerobot_wmrl.envs.lerobot_env import make_tensor_env, runs_in_processes
 from lerobot_wmrl.improve.stages import list_stages
 from tests.commands import run_here
-from tests.hub_client import hub as hub
 from tests.hub_server import Hub, Repo
 from tests.improve.made_up import improvement_of
 from tests.rl.checkpoints import save_untrained_policy

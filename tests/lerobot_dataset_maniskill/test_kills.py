@@ -46,7 +46,7 @@ def test_a_disk_that_is_full_costs_only_the_unfinished_part(tmp_path: Path, writ
 
 
 def test_twenty_kills_cost_nothing_that_was_finished(tmp_path: Path, writers: Writers) -> None:
-    order = Order(str(tmp_path), num_episodes=90, part_episodes=2)
+    order = Order(str(tmp_path), num_episodes=50, part_episodes=2)
     work, parts = order.work, planned_parts(order.config)
     work.mkdir()
     for num_episodes in (2, 4):  # The first one waits for the program to import everything.
@@ -67,7 +67,7 @@ def test_twenty_kills_cost_nothing_that_was_finished(tmp_path: Path, writers: Wr
         finished = now
     write_missing(order.config, work)
     merge(source_of(order.config), work, order.config.root, order.config.dataset_id)
-    assert find_damage(tmp_path / "dataset", 90) is None
+    assert find_damage(tmp_path / "dataset", 50) is None
     table = read_episodes(open_dataset(tmp_path / "dataset"))
-    assert sorted(table.columns[START_SEED]) == list(range(90))
+    assert sorted(table.columns[START_SEED]) == list(range(50))
     assert set(table.length) == {ROWS}

@@ -1,5 +1,6 @@
 """Plans, first without the simulator: the arm is replaced by one that achieves a third of each command."""
 
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
@@ -181,9 +182,13 @@ def succeeds(simulation: Simulation, kind: str, seed: int, planner: str = "carte
 def test_optimal_plans_succeed_and_near_misses_mostly_fail(blind: Simulation) -> None:
     """`experiments/planners.py` counts more of them."""
     optimal = sum(succeeds(blind, "optimal", seed) for seed in range(40))
-    near_misses = sum(succeeds(blind, "near_miss", seed) for seed in range(30))
     assert optimal >= 39
-    assert 1 <= near_misses <= 20
+    near_misses = Counter[bool]()
+    for seed in range(30):  # or until it is known that 1 to 20 of them succeed
+        near_misses[succeeds(blind, "near_miss", seed)] += 1
+        if near_misses[True] >= 1 and near_misses[False] >= 10:
+            return
+    pytest.fail(f"{near_misses[True]} of 30 near misses succeed")
 
 
 def test_optimal_plans_of_mplib_succeed(blind: Simulation) -> None:

@@ -45,12 +45,13 @@ def config(root: Path, **fields: object) -> RecordConfig:
     return RecordConfig(output_dir=root / "dataset", **{**settings, **fields})  # type: ignore[arg-type]
 
 
-def start_and_kill(root: Path, reached: str) -> Path:
-    """Start the command, `kill -9` it once a file like `reached` exists. → its folder of unfinished work"""
+def start_and_kill(root: Path, reached: str, workers: int) -> Path:
+    """Start the command with so many workers, `kill -9` it once a file like `reached` exists.
+    → its folder of unfinished work"""
     flags = [
         f"--num_episodes={EPISODES}",
         f"--part_episodes={PART}",
-        "--num_workers=2",
+        f"--num_workers={workers}",
         f"--kinds={json.dumps(KIND_SHARES)}",
         "--env.type=wmrl_maniskill",
         "--env.image_size=64",
@@ -62,10 +63,10 @@ def start_and_kill(root: Path, reached: str) -> Path:
     while not any(work.glob(reached)) and time.monotonic() < deadline and command.poll() is None:
         time.sleep(0.02)
     assert command.poll() is None, "the command ended by itself"
-    workers = psutil.Process(command.pid).children(recursive=True)
+    children = psutil.Process(command.pid).children(recursive=True)
     os.kill(command.pid, signal.SIGKILL)
     command.wait()
-    _, alive = psutil.wait_procs(workers, timeout=PATIENCE_S)
+    _, alive = psutil.wait_procs(children, timeout=PATIENCE_S)
     assert not alive, "the workers outlived the command"
     return work
 
@@ -74,8 +75,8 @@ def start_and_kill(root: Path, reached: str) -> Path:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished dataset whose recording was killed twice, and whose second part was torn."""
     root = tmp_path_factory.mktemp("recorded")
-    for reached in (".part-*.partial", "part-00000"):
-        work = start_and_kill(root, reached)
+    for reached, workers in ((".part-*.partial", 1), ("part-00000", 2)):
+        work = start_and_kill(root, reached, workers)
     first = (work / "part-00000" / "meta" / "info.json").stat().st_mtime_ns
     torn = work / ".part-00001.1.partial"
     (torn / "meta").mkdir(parents=True, exist_ok=True)

@@ -51,7 +51,6 @@ from lerobot_wmrl.rl.observations import ObservationBuffer
 from lerobot_wmrl.scripts.train import main
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 from lerobot_wmrl.world_models.planning import Planner
-from tests.hub_client import hub as hub
 from tests.hub_server import Hub
 from tests.lerobot_policy_openvla.small import small_policy
 from tests.rl.act_checkpoint import IMAGE, STATE, save_small_act

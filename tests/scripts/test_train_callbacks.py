@@ -22,7 +22,9 @@ from lerobot_wmrl.common.seeds import GATE_SEED
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.rl import recorders
 from lerobot_wmrl.scripts.train import main
+from tests.commands import run_here
 from tests.rl.checkpoints import save_untrained_policy
 from tests.rl.point_env import PointEnv
 
@@ -201,8 +203,9 @@ def test_the_gate_is_asked_before_the_first_update(improve: Any, capsys: pytest.
     assert read_metrics(out)[0]["gate/labelled/false_positive_rate/share"] == 1.0
 
 
-def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
+def test_gate_and_selection_in_the_simulator(improve: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Fresh rollouts are asked about, and real success stands beside imagined."""
+    monkeypatch.setattr(recorders, "run_subcommand", lambda command: run_here(*command))
     out = improve(
         *PUSH,
         *SHORT,
