@@ -15,7 +15,7 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data import decoding
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
-from lerobot_wmrl.scripts.resample import ResampleConfig, main, summed_components
+from lerobot_wmrl.scripts.resample import ResampleConfig, check, main
 
 LENGTHS, FPS, SIDE = (7, 4), 50, 8
 CAMERA = "observation.images.top"
@@ -116,7 +116,7 @@ def test_annotations_are_refused(make_synthetic_dataset: Any, tmp_path: Path) ->
     told = make_synthetic_dataset(tmp_path / "told", episodes=1)
     told.features.update(language_feature_info())
     with pytest.raises(FieldError, match=r"has annotations \(language_persistent, language_events\)"):
-        summed_components(ResampleConfig(output_dir=tmp_path / "slow", every=5), told)
+        check(ResampleConfig(output_dir=tmp_path / "slow", every=5), told)
 
 
 def test_videos_stay_videos(make_synthetic_dataset: Any, tmp_path: Path, monkeypatch) -> None:
