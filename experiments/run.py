@@ -55,8 +55,6 @@ def run_study(study: Study, repeat: bool = False) -> None:
                 f"needs {name}, and {folder} is not finished: run experiments/{name}.yaml to its end first"
             )
     budget.begin(study)
-    (study.folder / RECORDS).mkdir(parents=True, exist_ok=True)
-    (study.folder / RUNNING).touch()
     for number, step in enumerate(study.steps, start=1):
         heading = f"[{number}/{len(study.steps)}] {step.name}"
         record = read_record(study.folder, step.name)
@@ -82,11 +80,13 @@ def run_study(study: Study, repeat: bool = False) -> None:
                 f"  now:  {step.command}\nGive --repeat to run it and all steps after it again, or another "
                 "output_dir=FOLDER."
             )
-    (study.folder / RUNNING).unlink()
+    (study.folder / RUNNING).unlink(missing_ok=True)
 
 
 def run_step(study: Study, step: Step, heading: str) -> None:
     """Print one command, run it, and record that it is finished."""
+    study.folder.mkdir(parents=True, exist_ok=True)
+    (study.folder / RUNNING).touch()
     if step.fresh:
         delete(written_by(study, [step]))
     checked = budget.check_datasets(study, step)

@@ -27,7 +27,7 @@ def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> "Iterator[Hub]":
 @pytest.fixture(scope="session", autouse=True)
 def quick_parsing() -> Iterator[None]:
     """LeRobot's commands look up the help text of every flag, which takes seconds and nobody reads here."""
-    from lerobot_wmrl.common.command_line import parsed_quickly
+    from lerobot_wmrl.common.quick_parsing import parsed_quickly
 
     with parsed_quickly():
         yield

@@ -152,24 +152,7 @@ class RecordConfig(RunConfig):
                     f"{self.env.type} has a setting of its own",
                     "set `env.episode_length`",
                 )
-        if self.seed < 0 or (self.policy is None and self.seed + self.num_episodes > EVALUATION_SEED):
-            raise FieldError(
-                "seed",
-                self.seed,
-                f"the seeds of planned trajectories are from 0 to {EVALUATION_SEED - 1}, those above are for "
-                "evaluation",
-                "choose a smaller one",
-            )
-        if not 0 <= self.exploration <= 1 or (self.exploration and self.policy is None):
-            problem = "must be a share of the action box, 0 to 1, for a policy's rollouts only"
-            raise FieldError("exploration", self.exploration, problem, "give `policy.path`, or leave it out")
-        if self.shard_of[1] > -(-self.num_episodes // self.part_episodes):
-            raise FieldError(
-                "shard",
-                self.shard,
-                "there are fewer sub-datasets than shards",
-                "take fewer shards, or lower `part_episodes`",
-            )
+        self._validate_numbers()
         require_choice(self, "planner", MOTIONS)
         if isinstance(self.env, WmrlManiSkillEnv) and self.env.batched:
             raise FieldError(
@@ -188,6 +171,27 @@ class RecordConfig(RunConfig):
                 self._refuse_like("leave it out")
         for task in self.tasks:
             task_of(task)
+
+    def _validate_numbers(self) -> None:
+        """Raise FieldError for a seed, an exploration or a shard that cannot be."""
+        if self.seed < 0 or (self.policy is None and self.seed + self.num_episodes > EVALUATION_SEED):
+            raise FieldError(
+                "seed",
+                self.seed,
+                f"the seeds of planned trajectories are from 0 to {EVALUATION_SEED - 1}, those above are for "
+                "evaluation",
+                "choose a smaller one",
+            )
+        if not 0 <= self.exploration <= 1 or (self.exploration and self.policy is None):
+            problem = "must be a share of the action box, 0 to 1, for a policy's rollouts only"
+            raise FieldError("exploration", self.exploration, problem, "give `policy.path`, or leave it out")
+        if self.shard_of[1] > -(-self.num_episodes // self.part_episodes):
+            raise FieldError(
+                "shard",
+                self.shard,
+                "there are fewer sub-datasets than shards",
+                "take fewer shards, or lower `part_episodes`",
+            )
 
     def _validate_rollouts(self) -> None:
         """Raise FieldError for a setting that needs the simulator, or for a missing policy."""

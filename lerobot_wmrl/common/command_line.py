@@ -6,19 +6,17 @@ import logging
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr
+from contextlib import redirect_stderr
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache, cached_property
 from io import StringIO
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, ClassVar, NamedTuple
 
 import draccus
 import yaml
 from draccus.utils import ParsingError
-from draccus.wrappers import docstring, field_wrapper
 from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
@@ -28,6 +26,7 @@ from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.flags import TYPE, format_flags, format_value
 from lerobot_wmrl.common.output_folders import RUN_CONFIG_FILE
 from lerobot_wmrl.common.presets import read_settings
+from lerobot_wmrl.common.quick_parsing import parsed_quickly
 from lerobot_wmrl.common.settings import (
     Setting,
     help_page,
@@ -248,19 +247,6 @@ def parse_flags[Config: RunConfig](config_class: type[Config]) -> Config:
         raise ValueError(parsing_error(stderr.getvalue().strip(), config_class)) from None
     config.given.update({name: given_path(name) for name in config.path_fields})
     return config
-
-
-@contextmanager
-def parsed_quickly() -> Iterator[None]:
-    """Keep draccus from looking for every flag's help text in source files, which takes seconds, and from
-    inspecting the same few classes of argparse anew for every flag."""
-    look_up, inspected = docstring.get_attribute_docstring, field_wrapper.inspect
-    docstring.get_attribute_docstring = lambda *_: docstring.AttributeDocString()
-    field_wrapper.inspect = SimpleNamespace(getfullargspec=cache(inspect.getfullargspec))
-    try:
-        yield
-    finally:
-        docstring.get_attribute_docstring, field_wrapper.inspect = look_up, inspected
 
 
 def parsing_error(message: str, config_class: type[RunConfig]) -> str:

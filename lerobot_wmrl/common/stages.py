@@ -29,12 +29,13 @@ import psutil
 import torch
 from lerobot.configs import parser
 
-from lerobot_wmrl.common.command_line import RunConfig, parsed_quickly, run_command
+from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.lerobot_commands import whole_checkpoint
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.processes import die_with, find_program, not_installed, own_progress_lock
+from lerobot_wmrl.common.quick_parsing import parsed_quickly
 
 MARKER = "settings.json"
 """File of the settings that stages are made from, in their folder."""

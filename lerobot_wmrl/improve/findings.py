@@ -142,6 +142,19 @@ def require_improvable(
     require_shown(table, range(len(table.start)))
 
 
+def require_learnt_successes(table: EpisodeTable, episodes: Sequence[int] | None) -> None:
+    """Raise FieldError if chosen episodes succeed, and all that do are held out from training."""
+    successes = table.success & table.among(episodes)
+    if successes.any() and not (successes & table.training(episodes)).any():
+        raise FieldError(
+            "dataset.root",
+            table.dataset.root,
+            f"its {successes.sum()} successful episodes are all held out from training, as every twentieth "
+            "episode is, so there is nothing to learn success from",
+            "record or label more successes",
+        )
+
+
 def inspect_dataset(
     table: EpisodeTable, policy: PreTrainedConfig, episodes: Sequence[int] | None, rollouts: int = 0
 ) -> Findings:
@@ -154,21 +167,14 @@ def inspect_dataset(
     """
     chosen = table.among(episodes)
     held_out, total = table.success[table.validation & chosen], len(chosen)
-    learnt = table.success[table.training(episodes)]
+    if not rollouts:
+        require_learnt_successes(table, episodes)
     table = table.subset(chosen)
     features, success = table.dataset.features, table.success
     keys = [key for key in policy.image_features if key.startswith(OBS_IMAGE)]
     sizes = {key: frame_size(features[key]) for key in keys if key in features}
     state = {OBS_STATE: tuple(features[OBS_STATE]["shape"])} if OBS_STATE in features else {}
     require_improvable(table, policy, {key: (3, *size) for key, size in sizes.items()} | state)
-    if not rollouts and not learnt.any():
-        raise FieldError(
-            "dataset.root",
-            table.dataset.root,
-            f"its {success.sum()} successful episodes are all held out from training, as every twentieth "
-            "episode is, so there is nothing to learn success from",
-            "record or label more successes",
-        )
     tasks = np.unique(table.column(START_TASK), return_counts=True)[1]
     done = [table.success_target[rows].sum() for rows in table.rows(range(len(success)))]
     return Findings(

@@ -24,7 +24,8 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 import lerobot_env_wmrl  # noqa: F401 (registers what LeRobot is to know)
 from lerobot_wmrl.common import stages
-from lerobot_wmrl.common.command_line import parse_flags, parsed_quickly
+from lerobot_wmrl.common.command_line import parse_flags
+from lerobot_wmrl.common.quick_parsing import parsed_quickly
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig
 
