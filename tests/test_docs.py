@@ -174,6 +174,10 @@ def test_the_readme_s_table_says_what_was_measured() -> None:
         shown = [mean_success(cells, bc), mean_success(simulated[budget], "simulated_ppo")]
         shown += [mean_success(cells, method) for method in imagined]
         assert f"| {title} | {len(cells)} | {' | '.join(shown)} |" in text
+    (pull,) = read_all("value_tasks")
+    shown = [mean_success([pull], name) for name in (best_bc([pull]), "imagined_ppo", "ppo_distilled")]
+    assert f"| [pull](docs/results.md#value_tasks), `cnn` | 8 + 300 | 1 | {shown[0]} | – |" in text
+    assert f"| 1 | {shown[0]} | – | {shown[1]} | {shown[2]} |" in text
     act = read_all("value_act")
     bc, ppo, distilled = (
         mean_success(act, name) for name in ("longer_filtered", "imagined_ppo", "distilled")
@@ -215,9 +219,7 @@ def test_the_readme_says_what_is_chance() -> None:
     (pick_place,) = groups(loader(ROOT / "docs"), SECOND_STUDY, SECOND_PARTS).values()
     over_seeds = ttest_1samp(gains(pick_place, "longer_discounted_ppo", "longer_filtered", "ind"), 0)
     assert over_seeds.pvalue > 0.05, "not significant over seeds"
-    by_seed = in_points(pick_place, "longer_discounted_ppo", "longer_filtered")
-    others = in_points(pick_place, "longer_imagined_ppo", "longer_filtered")
-    assert f"(by seed {by_seed}; with another discount {others}), three seeds prove none" in text
+    assert "With 25 + 300, and in pick and place, three seeds prove none." in text
 
 
 def test_the_readme_says_what_else_was_measured() -> None:
@@ -244,6 +246,12 @@ def test_the_objections_say_what_was_measured() -> None:
     known, unseen = (f"{', '.join(each[:-1])} and {each[-1]}" for each in over)
     assert f"by seed {known} points more than BC in known scenes, {unseen} in unseen ones" in text
     (pick_place,) = groups(loader(ROOT / "docs"), SECOND_STUDY, SECOND_PARTS).values()
+    for method, said in (
+        ("longer_discounted_ppo", "by seed {} points more in known scenes, 1, 7"),
+        ("longer_imagined_ppo", "from the same longer BC, by {} points"),
+    ):
+        by_seed = " and ".join(in_points(pick_place, method, "longer_filtered").rsplit(", ", 1))
+        assert said.format(by_seed) in text
     bc, ppo = (mean_success(pick_place, method) for method in ("iterated", "iterated_ppo"))
     in_rounds = in_points(pick_place, "iterated_ppo", "iterated").replace(", 22", " and 22")
     assert f"BC has {bc} and PPO from it {ppo}: by seed {in_rounds}" in text
