@@ -204,12 +204,8 @@ def inspect_dataset(
 
 def describe(table: EpisodeTable, sizes: Mapping[str, tuple[int, int]]) -> list[str]:
     """Describe a dataset in a few lines; sizes: camera → height and width of its frames."""
-    features, success, fps, longest = (
-        table.dataset.features,
-        table.success,
-        table.dataset.fps,
-        table.length.max(),
-    )
+    features, fps = table.dataset.features, table.dataset.fps
+    success, longest = table.success, table.length.max()
     state = component_names(features[OBS_STATE]) if OBS_STATE in features else ["none"]
     cameras = [f"{name} {height}x{width}" for name, (height, width) in sizes.items()]
     return [

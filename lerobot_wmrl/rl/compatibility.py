@@ -76,10 +76,9 @@ def settle_discount(cfg: TrainConfig) -> None:
 def progress_reward(cfg: TrainConfig) -> GeneralConfig | RuleBasedReward | None:
     """Return the settings of a reward that pays for progress made, None for others."""
     reward = cfg.env.reward if isinstance(cfg.env, WorldModelEnv | WmrlManiSkillEnv) else None
-    if not isinstance(reward, GeneralConfig | RuleBasedReward) or reward.form != "potential":
+    if not isinstance(reward, GeneralConfig | RuleBasedReward):
         return None
-    weight = reward.success_weight if isinstance(reward, GeneralConfig) else reward.alpha
-    return reward if weight < 1 else None
+    return reward if reward.alpha != 1 and reward.form == "potential" else None
 
 
 def warn_of_discount(cfg: TrainConfig, longest: int) -> None:

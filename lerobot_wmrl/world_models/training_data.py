@@ -127,6 +127,7 @@ def make_sampler(
         )
     check_episode_lengths(table.dataset.root, int(episodes.sum()), int(table.length[episodes].sum()))
     require_readable(model, table, read)
+    warn_of_success(config, table, episodes.nonzero()[0])
     return make_clip_sampler(model, table, episodes.nonzero()[0], batch_size, seed)
 
 
@@ -174,7 +175,6 @@ def make_clip_sampler(
 ) -> ClipSampler:
     """Make a sampler of clips from these episodes, with what else the model looks at or predicts."""
     config, tokenizer, dataset = model.config, model.tokenizer, table.dataset
-    warn_of_success(config, table, episodes)
     cameras, rows = config.tokenizer.camera_keys, table.row_numbers(episodes)
     depth = cached_depth(dataset, cameras, tokenizer.grid) if config.depth else None
     if depth is not None:

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,6 +31,19 @@ SMALL = {"horizon": 8, "execute": 3, "samples": 6, "elites": 2, "iterations": 2,
 IMAGE = "observation.images.third_view"
 
 
+def search(
+    value: Callable[[torch.Tensor], torch.Tensor],
+    mean: torch.Tensor,
+    low: torch.Tensor,
+    high: torch.Tensor,
+    **settings: int,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Search from these knots (B, K, A), with deviations of 1."""
+    sizes = {"samples": 64, "elites": 8, "iterations": 12, **settings}
+    spread, generator = torch.ones(mean.shape[-1]), torch.Generator().manual_seed(0)
+    return plan_knots(value, mean, spread, low, high, generator=generator, **sizes)
+
+
 def test_the_planner_finds_the_sequence_that_is_wanted():
     wanted = torch.linspace(-0.5, 0.5, 12)[:, None].expand(-1, 2)
 
@@ -37,18 +51,7 @@ def test_the_planner_finds_the_sequence_that_is_wanted():
         return -(actions - wanted).square().sum((1, 2))
 
     low, high = torch.full((2,), -1.0), torch.ones(2)
-    found, mean = plan_knots(
-        value,
-        torch.zeros(1, 4, 2),
-        torch.ones(2),
-        low,
-        high,
-        horizon=12,
-        samples=64,
-        elites=8,
-        iterations=12,
-        generator=torch.Generator().manual_seed(0),
-    )
+    found, mean = search(value, torch.zeros(1, 4, 2), low, high, horizon=12)
     actions = interpolate_knots(found, 12)
     assert (actions[0] - wanted).abs().max() < 0.1
     assert (interpolate_knots(mean, 12)[0] - wanted).abs().max() < 0.1
@@ -62,18 +65,7 @@ def test_searches_at_once_find_what_each_wants():
         return -(actions - goal).square().sum((1, 2))
 
     low, high = torch.full((1,), -1.0), torch.ones(1)
-    found, _ = plan_knots(
-        value,
-        torch.zeros(3, 4, 1),
-        torch.ones(1),
-        low,
-        high,
-        horizon=8,
-        samples=64,
-        elites=8,
-        iterations=12,
-        generator=torch.Generator().manual_seed(0),
-    )
+    found, _ = search(value, torch.zeros(3, 4, 1), low, high, horizon=8)
     assert (found - wanted[:, None, None]).abs().max() < 0.1
 
 
@@ -86,18 +78,7 @@ def test_the_planner_keeps_to_the_box_and_never_returns_worse_than_it_was_given(
         return ((actions - 0.1).abs() < 1e-6).all((1, 2)).float()
 
     mean = torch.full((2, 3, 1), 0.1)
-    found, _ = plan_knots(
-        value,
-        mean,
-        torch.ones(1),
-        low,
-        high,
-        horizon=6,
-        samples=16,
-        elites=4,
-        iterations=3,
-        generator=torch.Generator().manual_seed(0),
-    )
+    found, _ = search(value, mean, low, high, horizon=6, samples=16, elites=4, iterations=3)
     assert torch.equal(found, mean)
     assert torch.cat(asked).min() >= low - 1e-6
     assert torch.cat(asked).max() <= high + 1e-6
@@ -105,17 +86,15 @@ def test_the_planner_keeps_to_the_box_and_never_returns_worse_than_it_was_given(
 
 def test_where_all_is_equally_good_the_first_mean_is_kept_within_the_bounds():
     mean = torch.tensor([[[0.0], [2.0]]])
-    found, _ = plan_knots(
+    found, _ = search(
         lambda actions: torch.zeros(len(actions)),
         mean,
-        torch.ones(1),
         -torch.ones(1),
         torch.ones(1),
         horizon=4,
         samples=16,
         elites=4,
         iterations=3,
-        generator=torch.Generator().manual_seed(0),
     )
     assert torch.equal(found, mean.clamp(max=1))
 

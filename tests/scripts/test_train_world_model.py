@@ -5,7 +5,6 @@ import math
 import re
 import shlex
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.presets import PRESETS
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.dataset import TrainingData
-from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, main, next_command
+from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, next_command
 from lerobot_wmrl.world_models.checkpoint import config_to_continue, load_model, load_model_to_continue
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from tests.commands import run_here
@@ -53,25 +52,19 @@ def test_training_goes_on_with_the_weights_and_settings_of_a_checkpoint(
     trained_models: dict[str, Path],
     small_dataset,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """At a learning rate of next to nothing, one step later they are the same."""
     output_dir = tmp_path / "further"
-    monkeypatch.setattr(
-        sys,
-        "argv",
-        [
-            "lerobot-wmrl-train-world-model",
-            f"--model.path={trained_models[model]}",
-            "--precision=float32",
-            "--model.learning_rate=1e-12",
-            f"--dataset.root={small_dataset.root}",
-            "--steps=1",
-            "--batch_size=2",
-            f"--output_dir={output_dir}",
-        ],
+    run_here(
+        "lerobot-wmrl-train-world-model",
+        f"--model.path={trained_models[model]}",
+        "--precision=float32",
+        "--model.learning_rate=1e-12",
+        f"--dataset.root={small_dataset.root}",
+        "--steps=1",
+        "--batch_size=2",
+        f"--output_dir={output_dir}",
     )
-    main()
     before, after = (
         load_file(folder / TRAINED / "model.safetensors") for folder in (trained_models[model], output_dir)
     )
@@ -83,20 +76,15 @@ def test_training_goes_on_with_the_weights_and_settings_of_a_checkpoint(
 
 
 def test_a_path_without_a_model_is_named(
-    tmp_path: Path, small_dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, small_dataset, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(
-        sys,
-        "argv",
-        [
+    with pytest.raises(SystemExit) as stopped:
+        run_here(
             "lerobot-wmrl-train-world-model",
             f"--model.path={tmp_path}",
             f"--dataset.root={small_dataset.root}",
             f"--output_dir={tmp_path / 'new'}",
-        ],
-    )
-    with pytest.raises(SystemExit) as stopped:
-        main()
+        )
     assert stopped.value.code == 1
     assert f"--model.path={tmp_path}: no model can be loaded from it" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
@@ -127,23 +115,17 @@ def test_settings_that_do_not_fit_the_weights_are_refused(
     trained_models: dict[str, Path],
     small_dataset,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(
-        sys,
-        "argv",
-        [
+    with pytest.raises(SystemExit):
+        run_here(
             "lerobot-wmrl-train-world-model",
             f"--model.path={trained_models['action_world_model']}",
             *settings,
             f"--dataset.root={small_dataset.root}",
             "--batch_size=2",
             f"--output_dir={tmp_path / 'new'}",
-        ],
-    )
-    with pytest.raises(SystemExit):
-        main()
+        )
     assert re.search(message, capsys.readouterr().err)
     assert not (tmp_path / "new").exists()
 
@@ -152,26 +134,20 @@ def test_weights_that_are_truncated_are_named(
     trained_models: dict[str, Path],
     small_dataset,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     torn = tmp_path / "torn"
     shutil.copytree(trained_models["action_world_model"] / TRAINED, torn)
     weights = torn / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:1000])
-    monkeypatch.setattr(
-        sys,
-        "argv",
-        [
+    with pytest.raises(SystemExit):
+        run_here(
             "lerobot-wmrl-train-world-model",
             f"--model.path={torn}",
             f"--dataset.root={small_dataset.root}",
             "--batch_size=2",
             f"--output_dir={tmp_path / 'new'}",
-        ],
-    )
-    with pytest.raises(SystemExit):
-        main()
+        )
     assert f"{torn}: model.safetensors cannot be read" in capsys.readouterr().err
 
 
@@ -199,22 +175,17 @@ def test_a_model_of_the_hub_is_continued_from_the_revision_that_is_given(
 
 
 def test_frames_have_the_size_of_those_that_were_learnt_last(
-    trained_models: dict[str, Path], make_synthetic_dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    trained_models: dict[str, Path], make_synthetic_dataset, tmp_path: Path
 ) -> None:
     larger = make_synthetic_dataset(tmp_path / "larger", episodes=4, size=48)
-    monkeypatch.setattr(
-        sys,
-        "argv",
-        [
-            "lerobot-wmrl-train-world-model",
-            f"--model.path={trained_models['action_world_model']}",
-            f"--dataset.root={larger.root}",
-            "--steps=1",
-            "--batch_size=2",
-            f"--output_dir={tmp_path / 'further'}",
-        ],
+    run_here(
+        "lerobot-wmrl-train-world-model",
+        f"--model.path={trained_models['action_world_model']}",
+        f"--dataset.root={larger.root}",
+        "--steps=1",
+        "--batch_size=2",
+        f"--output_dir={tmp_path / 'further'}",
     )
-    main()
     model = load_model(tmp_path / "further", "action_world_model")
     assert model.config.observation_shapes["observation.images.third_view"] == (3, 48, 48)
 
@@ -239,7 +210,6 @@ def test_a_training_ends_with_what_it_made_how_good_it_is_and_what_comes_next(
     trained_models: dict[str, Path],
     make_synthetic_dataset,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Of twenty episodes the last is held out."""
@@ -247,8 +217,7 @@ def test_a_training_ends_with_what_it_made_how_good_it_is_and_what_comes_next(
         Path(make_synthetic_dataset(tmp_path / "data", episodes=20).root),
         tmp_path / "tokenizer",
     )
-    monkeypatch.setattr(sys, "argv", flags(root, tokenizer))
-    main()
+    run_here(*flags(root, tokenizer))
     said = capsys.readouterr().out
     assert f"{tokenizer}: a frame_tokenizer of 18,304 parameters, 0.1 MB." in said
     psnr = json.loads((tokenizer / "reconstruction.json").read_text())["psnr"]["third_view"]
@@ -257,12 +226,10 @@ def test_a_training_ends_with_what_it_made_how_good_it_is_and_what_comes_next(
     assert following[:2] == ["lerobot-wmrl-train-world-model", "--model.type=action_world_model"]
     assert f"--model.tokenizer_path={tokenizer}" in following
     tiny = ["--preset=tiny", "--steps=1", "--batch_size=2", "--model.device=cpu"]
-    monkeypatch.setattr(sys, "argv", [*flags(root, tmp_path / "again"), "--preset", "tiny"])
-    main()
+    run_here(*flags(root, tmp_path / "again"), "--preset", "tiny")
     again = capsys.readouterr().out.strip().splitlines()[-1].split()
     assert again[:3] == [following[0], "--preset=tiny", *following[1:2]]
-    monkeypatch.setattr(sys, "argv", [*following, *tiny])
-    main()
+    run_here(*following, *tiny)
     said = capsys.readouterr().out
     measured = json.loads((tmp_path / "action_world_model" / "held_out.json").read_text())
     assert f"On held-out episodes: loss {measured['loss']:.3f}, " in said
@@ -283,36 +250,24 @@ def test_a_run_is_resumed_where_there_is_one(
     """Unless the data is other than it was."""
     data = shutil.copytree(small_dataset.root, tmp_path / "data")
     given = flags(data, tmp_path / "run")
-    monkeypatch.setattr(sys, "argv", [*given, "--resume=true"])
     with pytest.raises(SystemExit):
-        main()
+        run_here(*given, "--resume=true")
     assert "--resume=true: there is no checkpoint in" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
-    monkeypatch.setattr(sys, "argv", given)
-    main()
+    run_here(*given)
     for stored in (tmp_path / "run", tmp_path / "run" / TRAINED):
-        monkeypatch.setattr(
-            sys,
-            "argv",
-            [
-                given[0],
-                f"--config_path={stored / 'train_config.json'}",
-                "--resume=true",
-                "--job_name=again",
-            ],
+        run_here(
+            given[0], f"--config_path={stored / 'train_config.json'}", "--resume=true", "--job_name=again"
         )
-        main()
         assert f"{tmp_path / 'run'}: already trained for 2 steps" in capsys.readouterr().out
     other = not precision.multiplies_bfloat16("cpu")
     monkeypatch.setattr(precision, "multiplies_bfloat16", lambda _: other)  # moved to such a machine
-    monkeypatch.setattr(sys, "argv", given)
-    main()
+    run_here(*given)
     assert f"{tmp_path / 'run'}: already trained for 2 steps" in capsys.readouterr().out
     statistics = data / "meta" / "stats.json"
     statistics.write_text(json.dumps(json.loads(statistics.read_text()), indent=1))
-    monkeypatch.setattr(sys, "argv", given)
     with pytest.raises(SystemExit):
-        main()
+        run_here(*given)
     assert "was begun with another content of dataset," in capsys.readouterr().err
 
 
@@ -331,8 +286,7 @@ def test_wandb_gets_the_metrics_of_the_file(
 
     monkeypatch.setattr("lerobot.common.wandb_utils.WandBLogger", Logger)
     given = flags(Path(small_dataset.root), tmp_path / "run", "--wandb.enable=true", "--log_freq=1")
-    monkeypatch.setattr(sys, "argv", given)
-    main()
+    run_here(*given)
     assert logged == read_metrics(tmp_path / "run")
 
 
