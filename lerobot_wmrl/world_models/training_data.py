@@ -127,7 +127,7 @@ def make_sampler(
         )
     check_episode_lengths(table.dataset.root, int(episodes.sum()), int(table.length[episodes].sum()))
     require_readable(model, table, read)
-    warn_of_success(config, table, episodes.nonzero()[0])
+    warn_of_unlearnt_success(config, table, episodes.nonzero()[0])
     return make_clip_sampler(model, table, episodes.nonzero()[0], batch_size, seed)
 
 
@@ -203,7 +203,7 @@ def make_clip_sampler(
     )
 
 
-def warn_of_success(config: Any, table: EpisodeTable, episodes: np.ndarray) -> None:
+def warn_of_unlearnt_success(config: Any, table: EpisodeTable, episodes: np.ndarray) -> None:
     """Warn where a world model would not learn from these episodes what success is."""
     root, fps = table.dataset.root, table.dataset.fps
     if isinstance(config, ActionWorldModelConfig) and not table.has_labels:
