@@ -16,9 +16,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lerobot_dataset_maniskill import maniskill
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import planned_parts
+from lerobot_dataset_maniskill.simulated import record_in_parallel
 from lerobot_dataset_maniskill.worker import PartRecorder, silence_libraries
 from lerobot_wmrl.common.constants import KINDS, PLAY, TASK_NAMES
 from lerobot_wmrl.common.files import write_json
@@ -58,9 +58,7 @@ def worker_rate(workers: int, episodes: int) -> float:
     times: list[float] = []
     with recording(num_episodes=episodes, part_episodes=1, num_workers=workers) as (config, folder):
         parts = planned_parts(config)
-        maniskill.record_in_parallel(
-            config, folder, parts, workers, lambda result: times.append(time.perf_counter())
-        )
+        record_in_parallel(config, folder, parts, workers, lambda result: times.append(time.perf_counter()))
     paced = times[WARM_UP * workers :]
     return 60 * (len(paced) - 1) / (paced[-1] - paced[0])
 

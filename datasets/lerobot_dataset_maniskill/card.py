@@ -60,7 +60,6 @@ def write_card(root: Path, repo_id: str, table: EpisodeTable) -> None:
     vocabulary = json.loads((root / VOCABULARY_FILE).read_text())
     text = CARD.format(
         title=title(repo_id),
-        what=IMAGINED if "world_model" in vocabulary["recording"] else "ManiSkill trajectories",
         name=repo_id,
         fps=FPS,
         episodes=len(table.length),
@@ -192,8 +191,6 @@ def as_bytes(image: np.ndarray) -> np.ndarray:
 
 DEPTH = "- `observation.images.<camera>_depth`: LeRobot depth maps, millimetres along the camera's axis.\n"
 
-IMAGINED = "A policy's episodes, imagined by a world model from the first frames of recorded ones,"
-
 CARD = """---
 license: apache-2.0
 task_categories: [robotics]
@@ -204,7 +201,7 @@ configs:
 ---
 {title}
 
-{what} recorded by `lerobot-wmrl-record`: {episodes} episodes, {frames} frames
+ManiSkill trajectories recorded by `lerobot-wmrl-record`: {episodes} episodes, {frames} frames
 ({minutes:.1f} minutes at {fps} Hz).
 
 {success}

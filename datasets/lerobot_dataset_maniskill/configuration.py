@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import draccus
-import numpy as np
 from huggingface_hub.errors import HFValidationError
 from huggingface_hub.utils import validate_repo_id
 from lerobot.configs.policies import PreTrainedConfig
@@ -26,7 +25,6 @@ from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, FPS, STATE_NAMES
 from lerobot_wmrl.maniskill.tasks import task_of
 
 LOCAL = "local"
@@ -74,8 +72,9 @@ class RecordConfig(RunConfig):
 
     like: DatasetSource = field(default_factory=DatasetSource)
     """For an environment that is not ManiSkill: a dataset of the same robot, `like.root` or `like.repo_id`,
-    with which the recording can then be merged. Its columns, their names and the range of the actions are
-    taken from it. Without it, columns are LeRobot's, and actions have numbers for names."""
+    with which the recording can then be merged. Its columns, their names, how frames are stored and the range
+    of the actions are taken from it. Without it, columns are LeRobot's, and actions have numbers for names,
+    in a world model the names that it has learnt from."""
 
     like_columns: bool = True
     """Take the columns of `like`. False takes names and the range of the actions alone, where the dataset has
@@ -117,8 +116,8 @@ class RecordConfig(RunConfig):
 
     exploration: float = 0.0
     """Noise on a policy's actions: the largest standard deviation, as a share of half the range of each
-    component; in ManiSkill and in imagination on translations alone. Each episode draws its own level from 0
-    to this one. The noise is correlated over about ten steps."""
+    component; in ManiSkill on translations alone, in a world model on what varied in its data. Each
+    episode draws its own level from 0 to this one. The noise is correlated over about ten steps."""
 
     budget: Path | None = None
     """Ledger of the real episodes that a method may learn from, a JSON file with limits (docs/protocol.md).
@@ -154,7 +153,7 @@ class RecordConfig(RunConfig):
                 )
         self._validate_numbers()
         require_choice(self, "planner", MOTIONS)
-        if isinstance(self.env, WmrlManiSkillEnv) and self.env.batched:
+        if self.in_maniskill and self.maniskill.batched:
             raise FieldError(
                 "env.batched", True, "a recording has a simulation in each process", "leave it out"
             )
@@ -163,12 +162,13 @@ class RecordConfig(RunConfig):
         self._validate_kinds()
         if self.push_to_hub:
             self._validate_publishing()
-        if not isinstance(self.env, WmrlManiSkillEnv):
+        if not self.in_maniskill:
             self._validate_rollouts()
         else:
-            self.env.selected_scenes()
+            self.maniskill.selected_scenes()
             if self.like.given:
-                self._refuse_like("leave it out")
+                problem = "episodes of ManiSkill's robot have columns of their own"
+                raise FieldError("like.root", self.like.name, problem, "leave it out")
         for task in self.tasks:
             task_of(task)
 
@@ -212,21 +212,8 @@ class RecordConfig(RunConfig):
                 "recorded episodes begin with first frames",
                 "leave it out",
             )
-        if isinstance(self.env, WorldModelEnv) and not self.elsewhere and not self.env.dataset.given:
-            raise FieldError(
-                "env.dataset.root",
-                "",
-                "the episodes that imagined ones begin in are recorded with them",
-                "give a dataset in place of `env.dataset.frames` and `env.dataset.resets`",
-            )
-        if self.like.given and not self.elsewhere:
-            self._refuse_like("give `video` as a recording to merge it with has it, and leave this out")
-        if self.elsewhere and self.shard_of[1] > 1:
+        if self.shard_of[1] > 1:
             raise FieldError("shard", self.shard, "divides recordings in ManiSkill alone", "leave it out")
-
-    def _refuse_like(self, remedy: str) -> None:
-        problem = "episodes of ManiSkill's robot have columns of their own"
-        raise FieldError("like.root", self.like.name, problem, remedy)
 
     def _validate_kinds(self) -> None:
         planned = [kind for kind in KINDS if kind != POLICY]
@@ -264,26 +251,13 @@ class RecordConfig(RunConfig):
         return self.output_dir.resolve() if self.output_dir.is_symlink() else self.output_dir
 
     @property
-    def elsewhere(self) -> bool:
-        """Whether the environment is neither ManiSkill nor a world model that imagines ManiSkill's robot."""
-        if isinstance(self.env, WorldModelEnv):
-            from lerobot_wmrl.world_models.checkpoint import read_config
-
-            robot = read_config(self.env.world_model_path, "action_world_model").embodiment
-            if (robot.action_names, robot.state_names) != (list(ACTION_NAMES), list(STATE_NAMES)):
-                return True
-            same_range = np.allclose([robot.action_low, robot.action_high], [ACTION_LOW, ACTION_HIGH])
-            return not (robot.fps == FPS and same_range)  # that of resampled data takes larger actions
-        return not isinstance(self.env, WmrlManiSkillEnv)
-
-    @property
-    def imagination(self) -> WorldModelEnv | None:
-        """The environment, if it is a world model of ManiSkill, for use after `validate`."""
-        return self.env if isinstance(self.env, WorldModelEnv) else None
+    def in_maniskill(self) -> bool:
+        """Whether the episodes are simulated in ManiSkill."""
+        return isinstance(self.env, WmrlManiSkillEnv)
 
     @property
     def maniskill(self) -> WmrlManiSkillEnv:
-        """The environment in the simulator, for use after `validate`."""
+        """The environment, in the simulator."""
         assert isinstance(self.env, WmrlManiSkillEnv)
         return self.env
 
@@ -328,16 +302,19 @@ class RecordConfig(RunConfig):
         }
 
     def _env_content(self) -> dict[str, Any]:
-        if isinstance(self.env, WorldModelEnv):
-            return imagined_content(self.env)
-        if self.elsewhere:
-            return {
-                "env": draccus.encode(self.env, EnvConfig),
-                "like": asdict(self.like),
-                "like_columns": self.like_columns,
-                "max_frames": self.max_frames,
-            }
-        return self._simulated_content()
+        if self.in_maniskill:
+            return self._simulated_content()
+        env = (
+            imagined_content(self.env)
+            if isinstance(self.env, WorldModelEnv)
+            else {"env": draccus.encode(self.env, EnvConfig)}
+        )
+        return {
+            **env,
+            "like": asdict(self.like),
+            "like_columns": self.like_columns,
+            "max_frames": self.max_frames,
+        }
 
     def _policy_content(self) -> dict[str, Any]:
         """Return what decides a policy's actions: its checkpoint, or its own settings if it has none."""

@@ -4,7 +4,7 @@
     lerobot-wmrl-record --policy.path=outputs/sft --env.type=wmrl_maniskill --num_episodes=60 \\
         --output_dir=outputs/rollouts
     lerobot-wmrl-record --policy.path=outputs/sft --env.type=world_model --env.world_model_path=W \\
-        --env.dataset.root=D --output_dir=outputs/imagined
+        --env.dataset.root=D --like.root=D --output_dir=outputs/imagined
     lerobot-wmrl-record --policy.path=outputs/sft --env.type=pusht --like.root=data/demonstrations \\
         --output_dir=outputs/rollouts
 
@@ -108,7 +108,7 @@ def run(config: RecordConfig) -> None:
             merge_shards(config.merge_shards, config.root, config.dataset_id)
     else:
         record(config)
-    if config.push_to_hub and config.elsewhere:
+    if config.push_to_hub and not config.in_maniskill:
         with publishing(config.dataset_id, ONLY_PUBLISHES.format(root=config.root)):
             create_repo(HfApi(), config.dataset_id, config.private, "dataset")
             open_dataset(config.root, config.dataset_id).push_to_hub(private=config.private)

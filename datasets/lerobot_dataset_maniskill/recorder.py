@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.elsewhere import Rollouts
-from lerobot_dataset_maniskill.maniskill import ManiSkillEpisodes
 from lerobot_dataset_maniskill.merging import already_recorded, merge_folders
+from lerobot_dataset_maniskill.rollouts import Rollouts
+from lerobot_dataset_maniskill.simulated import ManiSkillEpisodes
 from lerobot_dataset_maniskill.writer import find_damage
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.files import foreign_files, write_json, writing
@@ -22,7 +22,6 @@ from lerobot_wmrl.common.seeds import EVALUATION_SEED, GATE_SEED
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.ledger import IMAGINED, ROLLOUTS, Ledger
-from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 
 RECORDING_FILE: Final = "recording.json"
@@ -64,7 +63,7 @@ def record(config: RecordConfig) -> None:
     work = root.parent / f".{root.name}.recording"
     # as typed: an environment of the hub tells its configuration of its actions when it is made
     content = config.recorded_content()
-    source: Source = (Rollouts if config.elsewhere else ManiSkillEpisodes)(config, content)
+    source: Source = (ManiSkillEpisodes if config.in_maniskill else Rollouts)(config, content)
     imagined = isinstance(config.env, WorldModelEnv)
     ledger = None if config.budget is None else Ledger(config.budget)
     if ledger is not None:
@@ -99,13 +98,12 @@ def check_budget(config: RecordConfig, ledger: Ledger) -> None:
         with within("env"):
             check_starts(config.env.dataset, ledger)
         return
-    maniskill = config.env if isinstance(config.env, WmrlManiSkillEnv) else None
-    if maniskill and maniskill.split == "ood":
+    if config.in_maniskill and config.maniskill.split == "ood":
         raise FieldError(
             "env.split", "ood", "under a budget, nothing is recorded in unseen scenes", "choose ind"
         )
     end = config.seed + config.num_episodes
-    if end > EVALUATION_SEED and not (maniskill and config.seed >= GATE_SEED):
+    if end > EVALUATION_SEED and not (config.in_maniskill and config.seed >= GATE_SEED):
         raise FieldError(
             "seed",
             config.seed,

@@ -21,11 +21,10 @@ class ExplorationNoise:
         largest: the highest of the noise levels, as a share of `scale`.
         seed: seed of the episode.
         scale: half the range of each component, in the units of actions. (A,)
-        visit: number of earlier episodes with this seed; each has noise of its own.
     """
 
-    def __init__(self, largest: float, seed: int, scale: np.ndarray, visit: int = 0) -> None:
-        self.rng = np.random.default_rng((seed, EXPLORATION_STREAM, visit))
+    def __init__(self, largest: float, seed: int, scale: np.ndarray) -> None:
+        self.rng = np.random.default_rng((seed, EXPLORATION_STREAM))
         self.level = self.rng.uniform(0.0, largest) * scale
         self.state = self.rng.normal(size=len(scale))
 

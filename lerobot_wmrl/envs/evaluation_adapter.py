@@ -74,9 +74,9 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         if begun >= starts and len(self._seeds) > begun and not self._repeats:
             self._repeats = True
             logging.warning(
-                "there are %d starts for more episodes: from the same start a policy that draws no "
-                "actions does the same again, which says nothing new. Ask for %d episodes, or give more "
-                "starts (env.dataset)",
+                "there are %d starts for more episodes: from the same start a policy does the same again, "
+                "which says nothing new, unless its actions are drawn or have noise. Ask for %d episodes, "
+                "or give more starts (env.dataset)",
                 starts,
                 starts,
             )

@@ -11,14 +11,19 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig, HubEnvConfig, LiberoEnv
-from lerobot.envs.utils import NEW_ROLLOUT_OPTION, FreezeAfterEpisodeEnd, preprocess_observation
+from lerobot.envs.utils import (
+    NEW_ROLLOUT_OPTION,
+    FreezeAfterEpisodeEnd,
+    env_to_policy_features,
+    preprocess_observation,
+)
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.policies import LoadedPolicy
-from lerobot_wmrl.common.policy_checks import check_fit, learnt_range, seen_shape
+from lerobot_wmrl.common.policy_checks import check_fit, fit_to_environment, learnt_range, seen_shape
 from lerobot_wmrl.common.seeds import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_hub import HubEnv
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -43,6 +48,19 @@ def make_tensor_env(config: EnvConfig, n_envs: int, device: str) -> TensorEnv:
 def is_own(config: EnvConfig) -> bool:
     """Return whether an environment is one of this project's."""
     return hasattr(config, "create_tensor_env")
+
+
+def check_fit_to(config: EnvConfig, policy: PreTrainedConfig) -> None:
+    """Raise FieldError unless policy and environment fit; a policy without features takes the environment's.
+
+    Only this project's environments are checked: LeRobot's own may show a policy more than they declare.
+    """
+    if not is_own(config):
+        return
+    features = env_to_policy_features(config)
+    action = features.pop(ACTION)
+    shown = {name: tuple(feature.shape) for name, feature in features.items()}
+    fit_to_environment(policy, shown, action.shape[0])
 
 
 def runs_in_processes(config: EnvConfig) -> bool:

@@ -15,7 +15,7 @@ from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.scripts.lerobot_eval import rollout
-from lerobot.utils.constants import ACTION, OBS_IMAGE
+from lerobot.utils.constants import ACTION, OBS_IMAGE, TRUNCATED
 from lerobot.utils.random_utils import seeded_context
 from torch import Tensor
 
@@ -36,7 +36,8 @@ from lerobot_wmrl.data.embodiment import (
 )
 from lerobot_wmrl.data.features import encoder_of, episode_features, matched, observation_row, row_in
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.envs.lerobot_env import FRAME_LIMIT, counts_resets, freeze_finished
+from lerobot_wmrl.envs.lerobot_env import FRAME_LIMIT, check_fit_to, counts_resets, freeze_finished
+from lerobot_wmrl.envs.start_frames import origins
 
 IMAGE_WRITERS = 4
 """Threads that compress the frames of rollouts in a LeRobot environment."""
@@ -73,7 +74,7 @@ class RolloutRecorder:
         self.config, self.exploration, self.video = env, exploration, video
         self.columns = like.features if like is not None and like_columns else None
         self.robot_type = like.robot_type if like is not None else None
-        self.hold = env.done_frames if isinstance(env, WorldModelEnv) else 1
+        check_fit_to(env, policy)
         self.policy = LoadedPolicy.load(policy)
         self.env_processors = make_env_pre_post_processors(env, policy)
         made = make_env(env, num_envs, use_async_envs=False)
@@ -83,9 +84,10 @@ class RolloutRecorder:
                 each.set_attr(FRAME_LIMIT, min(max_frames, each.get_attr(FRAME_LIMIT)[0]))
         for each in self.envs:
             freeze_finished(each)
-        self.robot = robot or robot_of(env, self.envs[0], like)
+        self.world = World.of(env, self.envs[0], self.policy) if isinstance(env, WorldModelEnv) else None
+        self.robot = robot or (self.world.robot if self.world else robot_of(env, self.envs[0], like))
         self.envs = [SuccessOfAll(each) for each in self.envs]
-        self.range_is_guessed = robot is None and like is None and not isinstance(env, WorldModelEnv)
+        self.range_is_guessed = robot is None and like is None and self.world is None
         try:
             self.encoder = encoder_of(self.columns or {})
         except ValueError as error:  # LeRobot reads more codecs than it writes
@@ -166,15 +168,16 @@ class RolloutRecorder:
         return recording, taken
 
     def _scale(self) -> np.ndarray:
-        return (np.array(self.robot.action_high) - np.array(self.robot.action_low)) / 2
+        scale = (np.array(self.robot.action_high) - np.array(self.robot.action_low)) / 2
+        return scale if self.world is None else np.where(self.world.varied, scale, 0.0)
 
     def _create(self, folder: Path, observation: Observation) -> LeRobotDataset:
         """Create an empty dataset for what this observation shows."""
         whole = {"dtype": "int64", "shape": (1,), "names": None}
         recorded = {
             **episode_features(observation, self.robot, "video" if self.video else "image"),
-            START_SEED: whole,
-            START_KIND: whole,
+            TRUNCATED: {"dtype": "bool", "shape": (1,), "names": None},
+            **dict.fromkeys([*(self.world.begun if self.world else ()), START_SEED, START_KIND], whole),
         }
         features = recorded if self.columns is None else matched(recorded, self.columns)
         return LeRobotDataset.create(
@@ -200,16 +203,19 @@ class RolloutRecorder:
         """Add the episode of one environment of a rollout. Return whether it succeeds."""
         success = bool(taken["success"][row, length - 1])
         labelled = "next.success" in dataset.features  # else next.done is taken for it
+        hold = self.world.done_frames if self.world else 1
+        begun = {START_SEED: np.array([seed]), **(self.world.begun_as(seed) if self.world else {})}
         for step in range(length):
             observation = recording.observations[step]
             frame: dict[str, Any] = observation_row(observation, row)
-            solved = bool(taken["success"][row, step]) or (success and step >= length - self.hold)
+            solved = bool(taken["success"][row, step]) or (success and step >= length - hold)
             frame |= {
                 ACTION: recording.actions[step][row],
                 "next.reward": np.array([float(taken["reward"][row, step])], np.float32),
                 "next.success": np.array([solved]),
                 "next.done": np.array([step == length - 1 if labelled else solved]),
-                START_SEED: np.array([seed]),
+                TRUNCATED: np.array([step == length - 1 and not success]),
+                **begun,
                 START_KIND: np.array([KINDS.index(POLICY)]),
             }
             kept = row_in(dataset.features, frame)
@@ -253,8 +259,6 @@ def robot_of(config: EnvConfig, env: Any, like: Any | None) -> Embodiment:
     Raises:
         FieldError: the actions of both have other numbers of components, or neither says how large they are.
     """
-    if isinstance(config, WorldModelEnv):
-        return env.env.model.config.embodiment
     space = env.single_action_space
     low, high = np.asarray(space.low, float).tolist(), np.asarray(space.high, float).tolist()
     bounded = bool(np.isfinite([low, high]).all())
@@ -302,6 +306,41 @@ def widened(config: EnvConfig, low: list[float], high: list[float], like: Any) -
             ", ".join(beyond),
         )
     return Embodiment(action_low=np.minimum(low, least).tolist(), action_high=np.maximum(high, most).tolist())
+
+
+@dataclass(frozen=True)
+class World:
+    """What a world model says of its imagined episodes.
+
+    Args:
+        robot: the robot that it has learnt from.
+        done_frames: the frames at an episode's end that make it a success.
+        varied: whether a component of the actions varied in its data: of others it does not know what they
+            do. (A,)
+        begun: of the recorded episodes that imagined ones begin in, the columns `START_ORIGIN` that their
+            dataset has. (K,) each
+    """
+
+    robot: Embodiment
+    done_frames: int
+    varied: np.ndarray
+    begun: dict[str, np.ndarray]
+
+    @classmethod
+    def of(cls, config: WorldModelEnv, env: Any, policy: LoadedPolicy) -> "World":
+        """Return that of an environment of `config`. FieldError if the policy acts in other units."""
+        imagination = env.env
+        imagination.accept(policy)
+        return cls(
+            imagination.model.config.embodiment,
+            config.done_frames,
+            imagination.model.action_deviation().cpu().numpy() > 0,
+            origins(config.dataset),
+        )
+
+    def begun_as(self, seed: int) -> dict[str, np.ndarray]:
+        """Return how the recorded episode began that the imagined one of this seed begins in. (1,) each"""
+        return {name: values[[seed % len(values)]] for name, values in self.begun.items()}
 
 
 @dataclass

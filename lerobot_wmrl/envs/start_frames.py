@@ -14,7 +14,7 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import INSTRUCTIONS, START_SCENE, START_TASK, TASK_NAMES
+from lerobot_wmrl.common.constants import INSTRUCTIONS, START_SCENE, START_SEED, START_TASK, TASK_NAMES
 from lerobot_wmrl.common.errors import FieldError, renamed, within
 from lerobot_wmrl.common.images import stretch, to_pixels
 from lerobot_wmrl.common.statistics import evenly_spaced
@@ -107,6 +107,17 @@ def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
     episodes = max(1, source.max_starts // (1 + source.branches))
     with renamed("split", "dataset.split"):
         return choose_episodes(table, source.split, episodes, scene_splits(scene, source.split), wanted)
+
+
+def origins(source: StartFrames) -> dict[str, np.ndarray]:
+    """Return how the recorded episodes began in whose first frames imagined ones begin: task, scene and seed,
+    where the dataset says so; nothing of saved frames and resets. (K,) each"""
+    if not source.given:
+        return {}
+    table = read_episodes(source.open())
+    episodes = chosen_episodes(table, source)
+    known = [name for name in (START_TASK, START_SCENE, START_SEED) if name in table.columns]
+    return {name: table.columns[name][episodes] for name in known}
 
 
 def every_chosen_episode(table: EpisodeTable, source: StartFrames) -> np.ndarray:

@@ -14,18 +14,22 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
-from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.scripts.lerobot_eval import eval_policy
-from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import seeded_context
 
 from lerobot_wmrl.common.checkpoints import resolved_name
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.policies import LoadedPolicy, check_weights, load_processors, read_policy_config
-from lerobot_wmrl.common.policy_checks import fit_to_environment
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
-from lerobot_wmrl.envs.lerobot_env import counts_resets, freeze_finished, is_own, runs_in_processes
+from lerobot_wmrl.envs.lerobot_env import (
+    check_fit_to,
+    counts_resets,
+    freeze_finished,
+    is_own,
+    runs_in_processes,
+)
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 from lerobot_wmrl.world_models.checkpoint import load_model
 
@@ -65,7 +69,7 @@ def read_policies(paths: Sequence[str], env: EnvConfig) -> dict[str, PreTrainedC
         with about_policy(path):
             configs[name] = config = read_policy_config(name, [])
             check_weights(config)
-            _check_environment(config, env)
+            check_fit_to(env, config)
             if model is not None:
                 model.check_units(config, load_processors(config)[1])
     return configs
@@ -81,19 +85,6 @@ def about_policy(path: str) -> Iterator[None]:
         raise FieldError("policies", path, f"{field}{error.problem}", error.remedy) from error
     except ValueError as error:
         raise FieldError("policies", path, first_line(error)) from error
-
-
-def _check_environment(config: PreTrainedConfig, env: EnvConfig) -> None:
-    """Raise FieldError unless policy and environment fit; a policy without features takes the environment's.
-
-    Only this project's environments are checked: LeRobot's own may show a policy more than they declare.
-    """
-    if not is_own(env):
-        return
-    features = env_to_policy_features(env)
-    action = features.pop(ACTION)
-    shown = {name: tuple(feature.shape) for name, feature in features.items()}
-    fit_to_environment(config, shown, action.shape[0])
 
 
 def load_policies(configs: Mapping[str, PreTrainedConfig]) -> list[LoadedPolicy]:

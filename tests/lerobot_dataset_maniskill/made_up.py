@@ -8,8 +8,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import EpisodePlan
-from lerobot_dataset_maniskill.maniskill import ManiSkillEpisodes
 from lerobot_dataset_maniskill.recorder import merge, missing_parts
+from lerobot_dataset_maniskill.simulated import ManiSkillEpisodes
 from lerobot_dataset_maniskill.worker import PartRecorder, ScriptedController
 from lerobot_dataset_maniskill.writer import StartColumns, StepResult, add_step
 from lerobot_wmrl.common.constants import TASK_NAMES

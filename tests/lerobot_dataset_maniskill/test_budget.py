@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from lerobot_dataset_maniskill import maniskill
+from lerobot_dataset_maniskill import simulated
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.record import run
 from lerobot_dataset_maniskill.recorder import record
@@ -27,8 +27,8 @@ from tests.rl.checkpoints import save_untrained_policy
 @pytest.fixture(autouse=True)
 def _made_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is simulated."""
-    monkeypatch.setattr(maniskill, "PartRecorder", MadeUpRecorder)
-    monkeypatch.setattr(maniskill.ManiSkillEpisodes, "check", lambda self: None)
+    monkeypatch.setattr(simulated, "PartRecorder", MadeUpRecorder)
+    monkeypatch.setattr(simulated.ManiSkillEpisodes, "check", lambda self: None)
 
 
 @pytest.fixture

@@ -17,8 +17,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import planned_parts
-from lerobot_dataset_maniskill.maniskill import follow_workers
 from lerobot_dataset_maniskill.recorder import missing_parts, record
+from lerobot_dataset_maniskill.simulated import follow_workers
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, find_damage
 from lerobot_wmrl.common.constants import KINDS, START_KIND
 from lerobot_wmrl.common.output_folders import require_same

@@ -1,4 +1,4 @@
-"""Episodes of planners and policies in ManiSkill or a world model of it, recorded by several processes."""
+"""Episodes of planners and policies in ManiSkill, recorded by several processes."""
 
 import queue
 from collections import Counter
@@ -10,7 +10,6 @@ from typing import Any, Final
 from tqdm import tqdm
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.imagined import ImaginedPartRecorder
 from lerobot_dataset_maniskill.manifest import DatasetPart, planned_parts
 from lerobot_dataset_maniskill.merging import describe, recorded_settings
 from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
@@ -43,8 +42,6 @@ class ManiSkillEpisodes:
 
     def check(self) -> None:
         """Raise ValueError unless there is a renderer, and the cameras show what the policy needs."""
-        if self.config.imagination is not None:
-            return
         render_backend()
         if self.config.policy is not None:
             shapes = self.config.maniskill.observation_shapes()
@@ -53,11 +50,10 @@ class ManiSkillEpisodes:
     def record(self, work: Path, missing: Sequence[str]) -> None:
         """Record the missing parts, in this process or in several."""
         config, parts = self.config, [part for part in self.planned if part.name in missing]
-        count = min(config.num_workers, len(parts)) if config.imagination is None else 1
+        count = min(config.num_workers, len(parts))
         with progress_bar(sum(self.parts.values()), parts) as report:
             if count == 1:
-                make = PartRecorder if config.imagination is None else ImaginedPartRecorder
-                recorder = make(config, work)
+                recorder = PartRecorder(config, work)
                 for part in parts:
                     recorder.record(part, report)
             else:

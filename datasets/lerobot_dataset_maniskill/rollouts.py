@@ -1,4 +1,4 @@
-"""A policy's rollouts outside ManiSkill: in LeRobot's environments, and in world models of other robots."""
+"""A policy's rollouts in any environment but ManiSkill: in LeRobot's, and in world models."""
 
 import json
 from collections import Counter

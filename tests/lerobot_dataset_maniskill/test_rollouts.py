@@ -17,9 +17,9 @@ from lerobot.envs.configs import PushtEnv
 from lerobot.utils.constants import DEFAULT_FEATURES, OBS_IMAGE
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.elsewhere import Rollouts
 from lerobot_dataset_maniskill.merging import merge_folders
 from lerobot_dataset_maniskill.recorder import record
+from lerobot_dataset_maniskill.rollouts import Rollouts
 from lerobot_wmrl.common.command_line import GivenPath
 from lerobot_wmrl.common.constants import START_SEED
 from lerobot_wmrl.common.files import write_json
