@@ -34,7 +34,8 @@ from lerobot_wmrl.common.presets import read_settings, without_other_types
 from lerobot_wmrl.common.settings import settings_of
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
-from lerobot_wmrl.data.ledger import Ledger
+from lerobot_wmrl.data.ledger import IMAGINED, Ledger
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.maniskill.scenes import describe_scenes
 
 MANISKILL: Final = RecordConfig().env.type
@@ -111,7 +112,9 @@ def run(config: RecordConfig) -> None:
     if config.push_to_hub and not config.in_maniskill:
         with publishing(config.dataset_id, ONLY_PUBLISHES.format(root=config.root)):
             create_repo(HfApi(), config.dataset_id, config.private, "dataset")
-            open_dataset(config.root, config.dataset_id).push_to_hub(private=config.private)
+            tags = [IMAGINED] if isinstance(config.env, WorldModelEnv) else []
+            recording = open_dataset(config.root, config.dataset_id)
+            recording.push_to_hub(private=config.private, tags=tags)
     elif config.push_to_hub:
         publish(HfApi(), config.root, config.dataset_id, config.private)
 

@@ -12,6 +12,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.merging import merge_folders
+from lerobot_dataset_maniskill.record import run
 from lerobot_dataset_maniskill.recorder import record
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
@@ -85,6 +86,12 @@ def test_they_can_be_merged_with_the_dataset_that_they_begin_in(config, small_da
     merge_folders([Path(small_dataset.root), config.root], tmp_path / "merged", "local/merged")
     merged = read_episodes(open_dataset(tmp_path / "merged"))
     assert merged.columns[START_SEED][-2:].tolist() == merged.columns[START_SEED][:2].tolist()
+
+
+def test_published_they_say_that_they_are_imagined(config, hub):
+    config.num_episodes, config.repo_id, config.push_to_hub = 1, "somebody/imagined", True
+    run(config)
+    assert "- imagined" in hub.dataset("somebody/imagined").head["README.md"].decode()
 
 
 def test_columns_of_other_data_are_refused_in_maniskill(small_dataset, tmp_path):
