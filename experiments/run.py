@@ -149,7 +149,7 @@ def publish(study: Study, docs: Path) -> list[Path]:
     """
     if study.collect:
         module, _, function = study.collect.partition(".")
-        collected = getattr(importlib.import_module(f"experiments.{module}"), function)(study)
+        collected = getattr(importlib.import_module(f"experiments.steps.{module}"), function)(study)
         for stem, content in collected.items():
             write_json(study.folder / f"{stem}.json", content)
     written = []

@@ -16,7 +16,7 @@ A file has these keys:
                variables, which hold in its cells
     steps      name, command; `for`: repeat the step for every combination; `fresh: true`: delete first what
                an interrupted run of it has left, since the command refuses that
-    collect    a function of this package, `module.function(study)`, that returns results by their stem
+    collect    a function of experiments.steps, `module.function(study)`, that returns results by their stem
     results    what appears in docs/, made by a step or by `collect` in the study's folder; with `$cell` in
                the name where the study has cells
 

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from experiments import four_tasks_section, value_figure
-from experiments.cells import Load
-from experiments.contents import CHAPTERS
+from experiments.page import four_tasks, value_figure
+from experiments.page.cells import Load
+from experiments.page.contents import CHAPTERS
 from experiments.study import ROOT, read_cells
 from lerobot_wmrl.common.files import write_text
 
@@ -132,7 +132,7 @@ def main() -> None:
         return
     load, images = loader(DOCS), DOCS / "images"
     value_figure.draw_value(load, images / "value_push.png")
-    four_tasks_section.draw(load, images / "value_four_tasks.png")
+    four_tasks.draw(load, images / "value_four_tasks.png")
     write_text(target, page)
     print(f"wrote {target.relative_to(ROOT)}")
 

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_1samp
 
-from experiments.tables import loader
-from experiments.value_cells import (
+from experiments.page.value_cells import (
     BASELINES,
     SCENES,
     SECOND_PARTS,
@@ -22,6 +21,7 @@ from experiments.value_cells import (
     gains,
     groups,
 )
+from experiments.tables import loader
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.stored_help import FOLDER
 from lerobot_wmrl.improve.progress import CLONED, DISTILLED, PPO, SFT

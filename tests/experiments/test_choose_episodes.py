@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from experiments.choose_episodes import main, optimal_episodes, successes
+from experiments.steps.choose_episodes import main, optimal_episodes, successes
 from lerobot_wmrl.data.episodes import read_episodes
 from tests.recorded import write_recording
 from tests.relabelled import UNLABELLED, relabelled

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from experiments.choose_policy import chosen_policy, main
+from experiments.steps.choose_policy import chosen_policy, main
 from lerobot_wmrl.evaluation.comparison import most_successful
 
 

@@ -3,9 +3,10 @@
 from pathlib import Path
 from typing import Any
 
-from experiments.foreign import POLICIES, TIMED, metaworld, section
+from experiments.page.foreign import section
+from experiments.steps.foreign import POLICIES, TIMED, metaworld
+from experiments.steps.success import rate
 from experiments.study import Study
-from experiments.success import rate
 from lerobot_wmrl.common.files import write_json
 
 OUTCOMES = {

@@ -5,7 +5,7 @@ import argparse
 import numpy as np
 import pytest
 
-from experiments.goal_distance import MEASURES, compare, imagined, lowest_threshold
+from experiments.steps.goal_distance import MEASURES, compare, imagined, lowest_threshold
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.evaluation.outcomes import Outcomes, predict_outcomes

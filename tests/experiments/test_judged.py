@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from experiments.judged import SCENES, agreement, by_scene, compatible, judged
+from experiments.steps.judged import SCENES, agreement, by_scene, compatible, judged
 from lerobot_wmrl.common.statistics import Proportion
 
 PERFECT = {

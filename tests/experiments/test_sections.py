@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from experiments.policy_sections import demo
+from experiments.page.policies import demo
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
 from lerobot_wmrl.improve.progress import CLONED, DISTILLED, SFT
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from experiments.shuffled import donor_rows, shuffle
+from experiments.steps.shuffled import donor_rows, shuffle
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from experiments.budget import check_commands
-from experiments.contents import CHAPTERS
+from experiments.page.contents import CHAPTERS
 from experiments.run import provenance
 from experiments.study import ROOT, read_cells
 from experiments.tables import results_page

@@ -6,7 +6,7 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from experiments.success import MeanChange
+from experiments.steps.success import MeanChange
 
 
 def test_the_interval_of_several_runs_counts_a_start_once() -> None:

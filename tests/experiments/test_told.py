@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.told import other_instructions, outcomes_with, told
+from experiments.steps.told import other_instructions, outcomes_with, told
 from lerobot_wmrl.common.constants import TASK_NAMES
 from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes

@@ -9,19 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import four_tasks_section, rewards_section, value
-from experiments.controls_section import CONTROLLED, CONTROLS, UNCHANGED, value_controls
-from experiments.run import record_path
-from experiments.study import ROOT, Study, read_cells
-from experiments.tables import loader
-from experiments.value_cells import TITLES, best, gain, groups
-from experiments.value_figure import draw_value
-from experiments.value_sections import (
+from experiments.page import four_tasks, rewards
+from experiments.page.controls import CONTROLLED, CONTROLS, UNCHANGED, value_controls
+from experiments.page.value import (
     aims,
     recorded_anew,
     value_others,
     value_push,
 )
+from experiments.page.value_cells import TITLES, best, gain, groups
+from experiments.page.value_figure import draw_value
+from experiments.run import record_path
+from experiments.steps import value
+from experiments.study import ROOT, Study, read_cells
+from experiments.tables import loader
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import Proportion, RunsMean
 
@@ -133,8 +134,8 @@ def test_methods_of_one_beginning_are_compared_with_it_seed_by_seed(docs: Path) 
             content["methods"]["grpo"] = content["methods"]["filtered"]
             content["methods"]["longer_filtered"] = content["methods"]["filtered"]
         write_json(docs / cell.results[0], content)
-    lines = rewards_section.section(loader(docs)).splitlines()
-    title = rewards_section.TITLES["success"]
+    lines = rewards.section(loader(docs)).splitlines()
+    title = rewards.TITLES["success"]
     assert f"| {title} | 40, 40 → 40 % (10–70) | 40, 40 → 40 % (10–70) | 7 |" in lines
     assert len([line for line in lines if line.startswith("| 0 |")]) == 1
     assert not any("Student" in line for line in lines)
@@ -149,8 +150,8 @@ def test_gains_of_three_seeds_have_an_interval_over_these(docs: Path) -> None:
         content["methods"]["longer_filtered"] = {"ind": FAILING, "ood": FAILING, "minutes": 7.0}
         content["methods"]["success"] = content["methods"]["filtered"]
         write_json(docs / cell.results[0], content)
-    title = rewards_section.TITLES["success"]
-    (row,) = [line for line in rewards_section.section(loader(docs)).splitlines() if " to +" in line]
+    title = rewards.TITLES["success"]
+    (row,) = [line for line in rewards.section(loader(docs)).splitlines() if " to +" in line]
     assert row == f"| {title} | +36.7 (+22.3 to +51.0) | +36.7 (+22.3 to +51.0) |", "30, 40 and 40 points"
 
 
@@ -200,7 +201,7 @@ def test_a_figure_is_drawn(docs: Path) -> None:
 
 
 def test_nothing_is_drawn_without_a_cell(tmp_path: Path) -> None:
-    for draw in (draw_value, four_tasks_section.draw):
+    for draw in (draw_value, four_tasks.draw):
         draw(loader(tmp_path), tmp_path / "value.png")
         assert not (tmp_path / "value.png").exists()
 
@@ -272,7 +273,7 @@ def test_four_tasks_are_collected_and_shown(tmp_path: Path, monkeypatch: pytest.
     ((name, content),) = value.four_tasks(study).items()
     assert content["minutes"] == {"cloning": 1, "longer": 2, "filtered": 2, "imagined_ppo": 7}
     write_json(tmp_path / "results" / "value_four_tasks" / f"{name}.json", content)
-    text = four_tasks_section.section(loader(tmp_path))
+    text = four_tasks.section(loader(tmp_path))
     known = "| push | known | 50 % (20–80) | 40 % (10–70) | 30 % (10–60)"
     unseen = "| pull | unseen | 50 % (20–80) | 40 % (10–70) | 60 % (30–90)"
     assert f"{known} | 80 % (50–100) |" in text
@@ -291,14 +292,14 @@ def test_four_tasks_are_collected_and_shown(tmp_path: Path, monkeypatch: pytest.
             for domain, rate in rates.items()
         }
     write_json(tmp_path / "results" / "value_four_tasks_simulator" / f"{name}.json", part)
-    text = four_tasks_section.section(loader(tmp_path))
+    text = four_tasks.section(loader(tmp_path))
     assert f"{known} | 90 % (70–100) | 80 % (50–100) |" in text
     assert re.search(r"\| push \| known \| \+30\.0 points .* \| -10\.0 points .* \| \+40\.0 points ", text)
-    four_tasks_section.draw(loader(tmp_path), tmp_path / "four.png")
+    four_tasks.draw(loader(tmp_path), tmp_path / "four.png")
     assert (tmp_path / "four.png").stat().st_size > 10_000
     another = {**content, "seed": 100000}
     write_json(tmp_path / "results" / "value_four_tasks" / f"{name[:-1]}100000.json", another)
-    text = four_tasks_section.section(loader(tmp_path))
+    text = four_tasks.section(loader(tmp_path))
     assert "Run with some seeds alone: PPO in ManiSkill with seed 0." in text
     assert "| push | known | 50, 50 → 50 % (20–80) | 40, 40 → 40 %" in text
 

@@ -14,8 +14,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.rewards.sarm.rabc import RABCWeights
 from lerobot.utils.sample_weighting import SampleWeightingConfig, make_sample_weighter
 
-from experiments import value_labels, value_model
-from experiments.value_labels import (
+from experiments.steps import value_labels, value_model
+from experiments.steps.value_labels import (
     NEGATIVE,
     advantages,
     label,
@@ -23,7 +23,7 @@ from experiments.value_labels import (
     relative_advantages,
     write_weights,
 )
-from experiments.value_model import cross_fitted_values, deal_folds, log_loss
+from experiments.steps.value_model import cross_fitted_values, deal_folds, log_loss
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.statistics import roc_auc

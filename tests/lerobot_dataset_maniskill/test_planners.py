@@ -180,7 +180,7 @@ def succeeds(simulation: Simulation, kind: str, seed: int, planner: str = "carte
 
 
 def test_optimal_plans_succeed_and_near_misses_mostly_fail(blind: Simulation) -> None:
-    """`experiments/planners.py` counts more of them."""
+    """`experiments/steps/planners.py` counts more of them."""
     optimal = sum(succeeds(blind, "optimal", seed) for seed in range(40))
     assert optimal >= 39
     near_misses = Counter[bool]()

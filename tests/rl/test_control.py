@@ -1,4 +1,4 @@
-"""A known control task by the trainer itself: `experiments/control.py`, shortened."""
+"""A known control task by the trainer itself: `experiments/steps/control.py`, shortened."""
 
 import json
 import sys
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments import control
+from experiments.steps import control
 
 
 def test_ppo_learns_to_balance_a_pole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,1 @@
+"""What the steps of studies run, and what collects their results."""
