@@ -3,7 +3,7 @@
 import sys
 from unittest.mock import patch
 
-from lerobot_wmrl.common.stages import entry_point
+from lerobot_wmrl.common.forks import entry_point
 
 
 def run_here(program: str, *flags: str) -> None:

@@ -25,12 +25,12 @@ from lerobot_dataset_maniskill.merging import merge_shards
 from lerobot_dataset_maniskill.publishing import ONLY_PUBLISHES, publish
 from lerobot_dataset_maniskill.recorder import record
 from lerobot_dataset_maniskill.worker import silence_libraries
-from lerobot_wmrl.common.command_line import chosen_types, run_command
+from lerobot_wmrl.common.command_line import run_command
 from lerobot_wmrl.common.errors import renamed, suggestion
 from lerobot_wmrl.common.files import writing
 from lerobot_wmrl.common.flags import format_flags
 from lerobot_wmrl.common.hub import create_repo, publishing
-from lerobot_wmrl.common.presets import read_settings, without_other_types
+from lerobot_wmrl.common.presets import chosen_types, read_settings, without_other_types
 from lerobot_wmrl.common.settings import settings_of
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes

@@ -12,7 +12,6 @@ from lerobot_wmrl.common.files import markdown_table as table
 FEW: Final = 10
 """Fewer policies than this have no correlation that says anything."""
 
-
 TOLERATED: Final = 0.15
 """Difference of imagined and real success beyond which a world model is wrong about a scene."""
 
@@ -82,9 +81,7 @@ def among_good(policies: Mapping[str, Mapping[str, Any]]) -> str:
 GOOD: Final = 0.5
 """Share of real successes above which a policy counts as good."""
 
-
 ESTIMATES: Final = ("imagined", "corrected", "calibrated")
-
 
 HEAD: Final = (
     "scenes",

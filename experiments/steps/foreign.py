@@ -10,7 +10,6 @@ from lerobot_wmrl.evaluation.comparison import COMPARISON_FILE
 
 CELL: Final = ("task", "episodes", "noise", "rollouts", "iterations", "seed")
 
-
 POLICIES: Final = {
     "cloned": "cloned from the expert's episodes",
     "further": "trained further on all successes, the expert's and its own",
@@ -18,7 +17,6 @@ POLICIES: Final = {
     "improve": "improved in imagination",
 }
 """Names of the policies, in the order of the study's comparison → what they are."""
-
 
 TIMED: Final = ("data", "cloned", "improve", "longer", "comparison")
 

@@ -29,12 +29,9 @@ from lerobot_wmrl.maniskill.scenes import scene_for_seed, scenes_of
 SCENES: Final = {"ind": [ALL_SCENES[index] for index in (0, 1, 2)], "ood": scenes_of("ood")}
 """Scenes of known and of unseen starts: the seed chooses among them."""
 
-
 COVERAGE: Final = 0.9
 
-
 DRAWS: Final = 200
-
 
 Row = Mapping[str, Any]
 """What is known of a policy: imagined and real success, the estimate, its training."""

@@ -3,16 +3,14 @@
 import inspect
 import json
 import logging
-import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cache, cached_property
 from io import StringIO
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import draccus
 import yaml
@@ -21,31 +19,27 @@ from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
+from lerobot_wmrl.common.command_errors import cause, parsing_error, said_in_flags, untyped
 from lerobot_wmrl.common.errors import STOPPED, FieldError, Stopped
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.flags import TYPE, format_flags, format_value
 from lerobot_wmrl.common.output_folders import RUN_CONFIG_FILE
-from lerobot_wmrl.common.presets import read_settings
+from lerobot_wmrl.common.presets import chosen_types, read_settings, typed_flags
 from lerobot_wmrl.common.quick_parsing import parsed_quickly
 from lerobot_wmrl.common.settings import (
-    Setting,
     help_page,
-    known_types,
     settings_of,
-    type_hints,
-    without_none,
 )
 
 MAPPINGS = "input_features", "output_features", "normalization_mapping", "norm_stats"
 """Settings of LeRobot's policies and reward models whose value is a mapping."""
 
+
 TEXTS = "str", "path", "Path"
 """Kinds of settings that are texts."""
 
-QUOTATION_MARKS = "\"'"
 
-FIELD = re.compile(r"`([\w.]+)((?:=[^`]*)?)`")
-"""A field in a message, alone or with a value: `dynamics.type=anchored`."""
+QUOTATION_MARKS = "\"'"
 
 
 class GivenPath(NamedTuple):
@@ -247,144 +241,3 @@ def parse_flags[Config: RunConfig](config_class: type[Config]) -> Config:
         raise ValueError(parsing_error(stderr.getvalue().strip(), config_class)) from None
     config.given.update({name: given_path(name) for name in config.path_fields})
     return config
-
-
-def parsing_error(message: str, config_class: type[RunConfig]) -> str:
-    """Return in one line why the command line was refused, from the `message` of argparse or draccus."""
-    group, reason = "", message.rpartition("error: ")[2]
-    if undecoded := re.match(r"`(\w+)`: Could not decode the value into any.*?\n\s*\w+: (.*)", reason, re.S):
-        group, reason = undecoded[1], refusal(undecoded[1], config_class) or undecoded[2]
-    if inner := re.match(r"`([\w.]+)`: (.*)", reason, re.S):
-        group, reason = ".".join(filter(None, (group, inner[1]))), inner[2]
-    if optional := re.fullmatch(r"Could not decode the value into any[^\n]*\n\s*\w+: ([^\n]*)\s*", reason):
-        reason = optional[1]  # of a setting that may be left out
-    settings = list(settings_of(config_class, chosen_types(sys.argv[1:])))
-    if "Expected a dict with a 'type' key" in reason:
-        kinds = [each.name for each in settings if each.name.endswith(TYPE)]
-        return "; ".join(
-            f"--{flag} is a setting of a type: give --{kind}=…" for flag, kind in untyped(kinds, sys.argv[1:])
-        )
-    unknown = re.findall(r"--([\w.-]+)", reason) if reason.startswith("unrecognized arguments") else []
-    if invalid := re.match(r"The fields? (.*) (?:is|are) not valid for", reason):
-        unknown = [".".join(filter(None, (group, name))) for name in re.findall(r"`(\w+)`", invalid[1])]
-    near = [near_flag(name, settings, config_class) for name in unknown]
-    hints = [f"did you mean --{name}?" if name else "see --help" for name in near]
-    problems = [f"there is no flag --{name}: {hint}" for name, hint in zip(unknown, hints, strict=True)]
-    return "; ".join(problems) or " ".join(f"{f'--{group}: ' if group else ''}{reason}".split())
-
-
-def untyped(kinds: Iterable[str], argv: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Yield flags that were typed although the type that they belong to was not, each with the type's flag.
-
-    kinds: names of the flags for types.
-    """
-    typed, chosen = typed_flags(argv), chosen_types(argv)
-    for group in (each.removesuffix(TYPE) for each in kinds):
-        flag = next((name for name in typed if name.startswith(f"{group}.")), None)
-        if flag and group not in chosen and f"{group}.path" not in typed:
-            yield flag, f"{group}{TYPE}"
-
-
-def refusal(name: str, config_class: type[RunConfig]) -> str | None:
-    """Return why the configuration of an optional field refuses its settings: draccus only says that it does.
-
-    Raises:
-        FieldError: it says which setting cannot be.
-    """
-    chosen = (known_types(without_none(type_hints(config_class)[name])) or {}).get(parser.get_type_arg(name))
-    if chosen is None:
-        return None
-    try:
-        with parsed_quickly(), redirect_stderr(StringIO()):
-            draccus.parse(chosen, args=parser.get_cli_overrides(name))
-    except (ParsingError, SystemExit) as error:
-        reason = cause(error)
-        if isinstance(reason, FieldError):
-            raise reason from None
-        if isinstance(error, ParsingError):
-            return str(error if "Couldn't parse" in str(error) else reason)
-    return None
-
-
-def near_flag(name: str, settings: Sequence[Setting], config_class: type[RunConfig]) -> str | None:
-    """Return the flag that somebody may have meant who typed `name`, None if no flag is near.
-
-    LeRobot's name for it counts first, then a flag that ends so, then one of the same group that is spelt
-    nearly so, then the same last word in another group.
-    """
-    group, _, last = name.rpartition(".")
-    lerobot_names = [config_class.other_names[name]] if name in config_class.other_names else []
-    known = sorted((each.name for each in settings), key=lambda each: each.count("."))
-    longer = [each for each in known if group and each.endswith(f".{name}")]
-    beside = {each.rpartition(".")[2]: each for each in known if each.rpartition(".")[0] == group}
-    spelt = [beside[each] for each in get_close_matches(last, beside, 1)]
-    elsewhere = [each for each in known if group and each.rpartition(".")[2] == last]
-    return next(iter([*lerobot_names, *longer, *spelt, *elsewhere]), None)
-
-
-def cause(error: BaseException) -> BaseException:
-    """Return the reason behind what draccus raises: the FieldError among its causes, else the next cause."""
-    each: BaseException | None = error
-    while each is not None and not isinstance(each, FieldError):
-        each = each.__cause__ or each.__context__
-    return each or (error.__cause__ if isinstance(error, ParsingError) and error.__cause__ else error)
-
-
-def chosen_types(argv: Sequence[str]) -> dict[str, str]:
-    """Return the types that a command line chooses, also by its `--config_path`: field → type."""
-    flags = typed_flags(argv)
-    path = Path(str(flags.get("config_path", "")))
-    stored = read_settings(path) if path.suffix in (".yaml", ".yml", ".json") and path.is_file() else {}
-    return {
-        name.removesuffix(TYPE): str(value)
-        for name, value in {**stored, **flags}.items()
-        if name.endswith(TYPE)
-    }
-
-
-def typed_flags(argv: Sequence[str]) -> dict[str, str]:
-    """Return the flags of a command line: name → value, of what is typed twice the last."""
-    split = [argument[2:].partition("=") for argument in argv if argument.startswith("--")]
-    return {name: value for name, _, value in split}
-
-
-def said_in_flags(error: BaseException, config_class: type, argv: Sequence[str]) -> str:
-    """Return an error's message, with fields as the flags that set them: `reward.form` → `--env.reward.form`.
-
-    Args:
-        error: a FieldError knows its field, relative to the configuration that raised it, and names others in
-            backquotes, as `Stopped` does. Any other error keeps its message.
-        config_class: class of the command's settings.
-        argv: what was typed.
-    """
-    if not isinstance(error, FieldError | Stopped):
-        return str(error)
-    typed = typed_flags(argv)
-    known = {each.name: each.default for each in settings_of(config_class, chosen_types(argv))}
-    known |= {name.rpartition(".")[0]: None for name in known if "." in name}
-    field, value = (error.field, error.value) if isinstance(error, FieldError) else ("", None)
-    flag = field and (flag_of(field, value, typed) or flag_of(field, value, known))
-    groups = (flag or "").removesuffix(field).split(".")[:-1]
-
-    def as_flag(match: re.Match[str]) -> str:
-        nearest = (".".join([*groups[:count], match[1]]) for count in range(len(groups), -1, -1))
-        option = next((name for name in nearest if name in known or name in typed), None)
-        option = option or flag_of(match[1], None, typed) or flag_of(match[1], None, known)
-        return f"--{option}{match[2]}" if option else match[0]
-
-    if isinstance(error, Stopped):
-        return re.sub(FIELD, as_flag, str(error))
-    problem, remedy = (re.sub(FIELD, as_flag, text) for text in (error.problem, error.remedy))
-    shown = "" if value in (None, "") else f"={format_value(value)}"
-    message = f"{f'--{flag}' if flag else field}{shown}: {problem}"
-    return f"{message}; {remedy}" if remedy else message
-
-
-def flag_of(field: str, value: object, flags: Mapping[str, Any]) -> str | None:
-    """Return the flag that ends with a field's name, one with that value first, then the shortest."""
-    matches = [name for name in flags if name == field or name.endswith(f".{field}")]
-    return min(
-        matches,
-        key=lambda name: (format_value(flags[name]) != format_value(value), name.count(".")),
-        default=None,
-    )

@@ -117,3 +117,21 @@ def _flat(content: Mapping[str, Any], whole: Sequence[str], prefix: str = "") ->
             yield from _flat(value, whole, f"{name}.")
         else:
             yield name, value
+
+
+def chosen_types(argv: Sequence[str]) -> dict[str, str]:
+    """Return the types that a command line chooses, also by its `--config_path`: field → type."""
+    flags = typed_flags(argv)
+    path = Path(str(flags.get("config_path", "")))
+    stored = read_settings(path) if path.suffix in (".yaml", ".yml", ".json") and path.is_file() else {}
+    return {
+        name.removesuffix(TYPE): str(value)
+        for name, value in {**stored, **flags}.items()
+        if name.endswith(TYPE)
+    }
+
+
+def typed_flags(argv: Sequence[str]) -> dict[str, str]:
+    """Return the flags of a command line: name → value, of what is typed twice the last."""
+    split = [argument[2:].partition("=") for argument in argv if argument.startswith("--")]
+    return {name: value for name, _, value in split}

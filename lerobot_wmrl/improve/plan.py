@@ -13,9 +13,9 @@ from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD, TRUN
 from lerobot_wmrl.common.checkpoints import best_model, last_model, resolved_path
 from lerobot_wmrl.common.constants import START_KIND, START_SEED
 from lerobot_wmrl.common.flags import Flags
+from lerobot_wmrl.common.forks import in_fork
 from lerobot_wmrl.common.policies import copy_checkpoint, load_processors
 from lerobot_wmrl.common.policy_checks import check_units
-from lerobot_wmrl.common.stages import in_fork
 from lerobot_wmrl.data.dataset import ChosenEpisodes, DatasetSource
 from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment
 from lerobot_wmrl.data.episodes import SUCCESS, read_episodes

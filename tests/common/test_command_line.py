@@ -18,13 +18,12 @@ from lerobot.robots import RobotConfig
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_wmrl import scripts
+from lerobot_wmrl.common.command_errors import near_flag, said_in_flags
 from lerobot_wmrl.common.command_line import (
     GivenPath,
     RunConfig,
-    near_flag,
     parse_flags,
     run_command,
-    said_in_flags,
     with_default_types,
     with_equals_signs,
     with_home,
@@ -108,7 +107,10 @@ def test_a_field_is_said_as_its_flag(error: ValueError, typed: list[str], messag
     ],
 )
 def test_a_flag_that_does_not_exist_leads_to_one_that_does(name: str, near: str | None) -> None:
-    assert near_flag(name, list(settings_of(TrainConfig, {"env": "world_model"})), TrainConfig) == near
+    assert (
+        near_flag(name, list(settings_of(TrainConfig, {"env": "world_model"})), TrainConfig.other_names)
+        == near
+    )
 
 
 @pytest.mark.parametrize(

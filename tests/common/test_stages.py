@@ -13,20 +13,12 @@ from pathlib import Path
 import pytest
 from lerobot.configs import parser
 
-from lerobot_wmrl.common import stages as runner
+from lerobot_wmrl.common import forks, stages
 from lerobot_wmrl.common.errors import STOPPED, FieldError
+from lerobot_wmrl.common.forks import entry_point, in_fork, run_measured, tree_memory
 from lerobot_wmrl.common.lerobot_commands import edit_command, train_command
 from lerobot_wmrl.common.seeds import EVALUATION_SEED
-from lerobot_wmrl.common.stages import (
-    Stage,
-    StageError,
-    entry_point,
-    in_fork,
-    read_record,
-    run_measured,
-    run_stages,
-    tree_memory,
-)
+from lerobot_wmrl.common.stages import Stage, StageError, read_record, run_stages
 from lerobot_wmrl.demo.stages import Demo, DemoConfig
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET
 
@@ -39,9 +31,9 @@ def run_code() -> None:
 @pytest.fixture(autouse=True)
 def commands_of_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     """Code that takes a moment stands for commands; it needs no preloaded library and no GPU."""
-    monkeypatch.setattr(runner, "entry_point", lambda program: run_code)
-    monkeypatch.setattr(runner.torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(runner, "preload", lambda modules, offline: None)
+    monkeypatch.setattr(forks, "entry_point", lambda program: run_code)
+    monkeypatch.setattr(forks.torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(stages, "preload", lambda modules, offline: None)
 
 
 def python(name: str, code: str) -> Stage:
@@ -238,7 +230,7 @@ def test_a_stage_does_not_read_this_program_s_config_file(
 
 def test_with_cuda_a_stage_is_a_fresh_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It cannot use CUDA in a fork of a process that has asked for it."""
-    monkeypatch.setattr(runner.torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(forks.torch.cuda, "is_available", lambda: True)
     log = tmp_path / "log"
     code = "import os, sys; print('torch' in sys.modules, os.getsid(0) == os.getpid()); sys.exit(3)"
     assert run_measured(["python", "-c", code], log, lambda *_: None) == 3
