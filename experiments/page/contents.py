@@ -45,6 +45,10 @@ CHAPTERS: Final[Mapping[str, Mapping[str, Section]]] = {
             "PPO and distillation from longer BC",
             partial(value.rows_above, ["longer_imagined_ppo", "longer_ppo_distilled"]),
         ),
+        "value_without_noise": Section(
+            "Rollouts without exploration noise",
+            partial(value.rows_above, ["noiseless", "longer_noiseless"]),
+        ),
         "value_iterated": Section(
             "Rollouts in three rounds",
             partial(value.rows_above, ["iterated", "iterated_ppo", "iterated_ppo_distilled"]),

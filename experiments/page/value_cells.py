@@ -14,6 +14,8 @@ TITLES: Final = {
     "longer": "BC of the demonstrations, three times as many steps",
     "filtered": "filtered BC: demonstrations and successful rollouts",
     "longer_filtered": "filtered BC, three times as many steps",
+    "noiseless": "filtered BC, rollouts without exploration noise",
+    "longer_noiseless": "filtered BC, rollouts without exploration noise, three times as many steps",
     "iterated": "filtered BC, rollouts in three rounds, last policy three times as many steps",
     "weighted": "advantage-weighted BC (RA-BC)",
     "conditioned": "advantage-conditioned BC (RECAP)",
@@ -63,6 +65,7 @@ STUDY: Final = "value_push"
 PARTS: Final = (
     "value_longer",
     "value_longer_imagined",
+    "value_without_noise",
     "value_others",
     "value_iterated",
     "value_simulator",
