@@ -73,8 +73,8 @@ class RecordConfig(RunConfig):
     like: DatasetSource = field(default_factory=DatasetSource)
     """For an environment that is not ManiSkill: a dataset of the same robot, `like.root` or `like.repo_id`,
     with which the recording can then be merged. Its columns, their names, how frames are stored and the range
-    of the actions are taken from it. Without it, columns are LeRobot's, and actions have numbers for names,
-    in a world model the names that it has learnt from."""
+    of the actions are taken from it. Without it, columns are LeRobot's, and actions have numbers for names. A
+    world model knows names and range itself: there only columns are taken."""
 
     like_columns: bool = True
     """Take the columns of `like`. False takes names and the range of the actions alone, where the dataset has

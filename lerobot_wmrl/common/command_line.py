@@ -26,18 +26,13 @@ from lerobot_wmrl.common.flags import TYPE, format_flags, format_value
 from lerobot_wmrl.common.output_folders import RUN_CONFIG_FILE
 from lerobot_wmrl.common.presets import chosen_types, read_settings, typed_flags
 from lerobot_wmrl.common.quick_parsing import parsed_quickly
-from lerobot_wmrl.common.settings import (
-    help_page,
-    settings_of,
-)
+from lerobot_wmrl.common.settings import help_page, settings_of
 
 MAPPINGS = "input_features", "output_features", "normalization_mapping", "norm_stats"
 """Settings of LeRobot's policies and reward models whose value is a mapping."""
 
-
 TEXTS = "str", "path", "Path"
 """Kinds of settings that are texts."""
-
 
 QUOTATION_MARKS = "\"'"
 

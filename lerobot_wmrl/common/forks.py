@@ -1,10 +1,10 @@
 """Console commands and functions that run in forks of this process.
 
 Forking from a process that has imported the libraries saves every command the ten seconds of import. With
-CUDA, which does not survive a fork, the process then starts the command anew.
+CUDA, which does not survive a fork, the process then starts the command anew, and functions are called in
+this process.
 """
 
-import importlib
 import importlib.metadata
 import multiprocessing
 import os
@@ -53,7 +53,7 @@ def in_fork[**P, T](function: Callable[P, T], *args: P.args, **kwargs: P.kwargs)
     """Call a function in a fork of this process, and return or raise what it does; all of it is pickled.
 
     What it leaves in libraries ends with the fork: once a process has rendered with OpenGL, as MuJoCo does,
-    stages that render wait for ever. Where stages are no forks, it is called in this process.
+    others that render wait for ever. Where this process must not fork (`may_fork`), it is called in it.
     """
     if not may_fork():
         return function(*args, **kwargs)

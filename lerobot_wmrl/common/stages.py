@@ -4,7 +4,6 @@ Each stage is one console command, run in a fork (`forks`).
 """
 
 import importlib
-import importlib.metadata
 import json
 import os
 import shlex

@@ -15,7 +15,7 @@ from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.scripts.lerobot_eval import rollout
-from lerobot.utils.constants import ACTION, OBS_IMAGE, TRUNCATED
+from lerobot.utils.constants import ACTION, OBS_IMAGE
 from lerobot.utils.random_utils import seeded_context
 from torch import Tensor
 
@@ -36,8 +36,9 @@ from lerobot_wmrl.data.embodiment import (
 )
 from lerobot_wmrl.data.features import encoder_of, episode_features, matched, observation_row, row_in
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.envs.lerobot_env import FRAME_LIMIT, check_fit_to, counts_resets, freeze_finished
-from lerobot_wmrl.envs.start_frames import origins
+from lerobot_wmrl.envs.world_recording import World
 
 IMAGE_WRITERS = 4
 """Threads that compress the frames of rollouts in a LeRobot environment."""
@@ -77,14 +78,17 @@ class RolloutRecorder:
         check_fit_to(env, policy)
         self.policy = LoadedPolicy.load(policy)
         self.env_processors = make_env_pre_post_processors(env, policy)
-        made = make_env(env, num_envs, use_async_envs=False)
-        self.envs = [each for tasks in made.values() for each in tasks.values()]
+        self.envs = environments(env, num_envs)
         if max_frames is not None:
             for each in self.envs:
                 each.set_attr(FRAME_LIMIT, min(max_frames, each.get_attr(FRAME_LIMIT)[0]))
         for each in self.envs:
             freeze_finished(each)
-        self.world = World.of(env, self.envs[0], self.policy) if isinstance(env, WorldModelEnv) else None
+        self.world = (
+            World.of(env, self.envs[0], self.policy, like if like_columns else None)
+            if isinstance(env, WorldModelEnv)
+            else None
+        )
         self.robot = robot or (self.world.robot if self.world else robot_of(env, self.envs[0], like))
         self.envs = [SuccessOfAll(each) for each in self.envs]
         self.range_is_guessed = robot is None and like is None and self.world is None
@@ -176,8 +180,9 @@ class RolloutRecorder:
         whole = {"dtype": "int64", "shape": (1,), "names": None}
         recorded = {
             **episode_features(observation, self.robot, "video" if self.video else "image"),
-            TRUNCATED: {"dtype": "bool", "shape": (1,), "names": None},
-            **dict.fromkeys([*(self.world.begun if self.world else ()), START_SEED, START_KIND], whole),
+            **(self.world.features() if self.world else {}),
+            START_SEED: whole,
+            START_KIND: whole,
         }
         features = recorded if self.columns is None else matched(recorded, self.columns)
         return LeRobotDataset.create(
@@ -204,7 +209,6 @@ class RolloutRecorder:
         success = bool(taken["success"][row, length - 1])
         labelled = "next.success" in dataset.features  # else next.done is taken for it
         hold = self.world.done_frames if self.world else 1
-        begun = {START_SEED: np.array([seed]), **(self.world.begun_as(seed) if self.world else {})}
         for step in range(length):
             observation = recording.observations[step]
             frame: dict[str, Any] = observation_row(observation, row)
@@ -214,14 +218,27 @@ class RolloutRecorder:
                 "next.reward": np.array([float(taken["reward"][row, step])], np.float32),
                 "next.success": np.array([solved]),
                 "next.done": np.array([step == length - 1 if labelled else solved]),
-                TRUNCATED: np.array([step == length - 1 and not success]),
-                **begun,
+                START_SEED: np.array([seed]),
+                **(
+                    self.world.columns(seed, truncated=step == length - 1 and not success)
+                    if self.world
+                    else {}
+                ),
                 START_KIND: np.array([KINDS.index(POLICY)]),
             }
             kept = row_in(dataset.features, frame)
             dataset.add_frame({**kept, "task": (observation.get("task") or [""])[row]})
         save_episode(dataset)
         return success
+
+
+def environments(config: EnvConfig, count: int) -> list[Any]:
+    """Make `count` copies of an environment, one vector environment a task; of a world model one for all of
+    its starts, whatever their tasks."""
+    if isinstance(config, WorldModelEnv):
+        return [EvaluationAdapter(config.create_tensor_env(count))]
+    made = make_env(config, count, use_async_envs=False)
+    return [each for tasks in made.values() for each in tasks.values()]
 
 
 class SuccessOfAll(gym.vector.VectorWrapper):
@@ -306,41 +323,6 @@ def widened(config: EnvConfig, low: list[float], high: list[float], like: Any) -
             ", ".join(beyond),
         )
     return Embodiment(action_low=np.minimum(low, least).tolist(), action_high=np.maximum(high, most).tolist())
-
-
-@dataclass(frozen=True)
-class World:
-    """What a world model says of its imagined episodes.
-
-    Args:
-        robot: the robot that it has learnt from.
-        done_frames: the frames at an episode's end that make it a success.
-        varied: whether a component of the actions varied in its data: of others it does not know what they
-            do. (A,)
-        begun: of the recorded episodes that imagined ones begin in, the columns `START_ORIGIN` that their
-            dataset has. (K,) each
-    """
-
-    robot: Embodiment
-    done_frames: int
-    varied: np.ndarray
-    begun: dict[str, np.ndarray]
-
-    @classmethod
-    def of(cls, config: WorldModelEnv, env: Any, policy: LoadedPolicy) -> "World":
-        """Return that of an environment of `config`. FieldError if the policy acts in other units."""
-        imagination = env.env
-        imagination.accept(policy)
-        return cls(
-            imagination.model.config.embodiment,
-            config.done_frames,
-            imagination.model.action_deviation().cpu().numpy() > 0,
-            origins(config.dataset),
-        )
-
-    def begun_as(self, seed: int) -> dict[str, np.ndarray]:
-        """Return how the recorded episode began that the imagined one of this seed begins in. (1,) each"""
-        return {name: values[[seed % len(values)]] for name, values in self.begun.items()}
 
 
 @dataclass

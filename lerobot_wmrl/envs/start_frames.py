@@ -36,21 +36,30 @@ GOLDEN_RATIO = (5**0.5 - 1) / 2
 """Its multiples, modulo 1, are spread over the unit interval, any of them in a row."""
 
 
+ORIGINS = START_TASK, START_SCENE, START_SEED
+"""Columns that say how a recorded episode began."""
+
+
 class StartImages(NamedTuple):
     """The frames in which K imagined episodes begin.
 
     images (K, N, H, W, 3) uint8; first_images, of the same shape: the first frame of the recorded episode
-    that each is taken from; state (K, P); K instructions; tasks (K,), indices into `TASK_NAMES`, −1 where
-    unknown; depth, a function of a world model that returns (K, S) in metres, or None if the model does not
-    look at depth.
+    that each is taken from; state (K, P); K instructions; origins, what is known of how these episodes began,
+    by the columns `start.task`, `start.scene` and `start.seed`, (K,) each; depth, a function of a world model
+    that returns (K, S) in metres, or None if the model does not look at depth.
     """
 
     images: np.ndarray
     first_images: np.ndarray
     state: np.ndarray
     instructions: list[str]
-    tasks: np.ndarray
+    origins: Mapping[str, np.ndarray]
     depth: Callable[[WorldModelRewardModel], Tensor | None]
+
+    @property
+    def tasks(self) -> np.ndarray:
+        """The task of each start, an index into `TASK_NAMES`, −1 where unknown. (K,)"""
+        return self.origins.get(START_TASK, np.full(len(self.images), -1))
 
     def of_task(self, task: int) -> "StartImages":
         """Return the starts of one task, an index into `TASK_NAMES`."""
@@ -69,7 +78,7 @@ class StartImages(NamedTuple):
             first_images=self.first_images[rows],
             state=self.state[rows],
             instructions=instructions,
-            tasks=self.tasks[rows],
+            origins={name: values[rows] for name, values in self.origins.items()},
             depth=depth,
         )
 
@@ -107,17 +116,6 @@ def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
     episodes = max(1, source.max_starts // (1 + source.branches))
     with renamed("split", "dataset.split"):
         return choose_episodes(table, source.split, episodes, scene_splits(scene, source.split), wanted)
-
-
-def origins(source: StartFrames) -> dict[str, np.ndarray]:
-    """Return how the recorded episodes began in whose first frames imagined ones begin: task, scene and seed,
-    where the dataset says so; nothing of saved frames and resets. (K,) each"""
-    if not source.given:
-        return {}
-    table = read_episodes(source.open())
-    episodes = chosen_episodes(table, source)
-    known = [name for name in (START_TASK, START_SCENE, START_SEED) if name in table.columns]
-    return {name: table.columns[name][episodes] for name in known}
 
 
 def every_chosen_episode(table: EpisodeTable, source: StartFrames) -> np.ndarray:
@@ -209,7 +207,7 @@ def recorded_frames(table: EpisodeTable, rows: np.ndarray, tokenizer_config: Tok
         first_images=images[table.start[episodes]],
         state=table.state[rows],
         instructions=[table.instructions[episode] for episode in episodes],
-        tasks=table.column(START_TASK)[episodes],
+        origins={name: table.columns[name][episodes] for name in ORIGINS if name in table.columns},
         depth=depth,
     )
 
@@ -223,8 +221,7 @@ def observed_frame(observation: Mapping[str, Any], tokenizer_config: TokenizerCo
     tensors = {name: value.cpu() for name, value in observation.items() if isinstance(value, Tensor)}
     images = to_pixels(stack_cameras(tensors, tokenizer_config.camera_keys, tokenizer_config.image_size))
     state = tensors.get(OBS_STATE, torch.zeros(len(images), 0)).float().numpy()
-    unknown = np.full(len(images), -1)
-    return StartImages(images, images, state, list(observation["task"]), unknown, without_depth)
+    return StartImages(images, images, state, list(observation["task"]), {}, without_depth)
 
 
 def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> StartImages:
@@ -267,7 +264,7 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
         raise FieldError("dataset.frames", path, f"{OBS_STATE} contains NaN or infinity")
     instructions = [str(text) for text in arrays[INSTRUCTIONS][rows]]
     squares = np.stack([_squares(arrays[name][rows], side) for name in shapes], 1)
-    return StartImages(squares, squares, state, instructions, np.full(len(rows), -1), without_depth)
+    return StartImages(squares, squares, state, instructions, {}, without_depth)
 
 
 def _squares(images: np.ndarray, side: int) -> np.ndarray:
@@ -307,17 +304,21 @@ def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> Star
     with within("dataset"):
         scenes = env.selected_scenes()
     simulation = env.create_simulation()
-    frames, instructions, indices = [], [], []
+    frames, instructions, begun = [], [], []
     for seed in range(source.resets):
-        simulation.task = task_of(tasks[seed // len(scenes) % len(tasks)])
-        frames.append(simulation.reset(scene_for_seed(scenes, seed), seed))
+        simulation.task, scene = (
+            task_of(tasks[seed // len(scenes) % len(tasks)]),
+            scene_for_seed(scenes, seed),
+        )
+        frames.append(simulation.reset(scene, seed))
         instructions.append(simulation.instruction)
-        indices.append(simulation.task.index)
+        begun.append((simulation.task.index, scene.index, seed))
     simulation.close()
     views = ([frame.images[camera] for frame in frames] for camera in tokenizer_config.cameras)
     images = np.stack([_squares(np.stack(view), tokenizer_config.image_size) for view in views], 1)
     state = np.stack([frame.state for frame in frames])
-    return StartImages(images, images, state, instructions, np.array(indices), without_depth)
+    origins = dict(zip(ORIGINS, np.array(begun).T, strict=True))
+    return StartImages(images, images, state, instructions, origins, without_depth)
 
 
 def maniskill_side(tokenizer_config: TokenizerConfig, field: str, value: object, remedy: str) -> int:

@@ -3,10 +3,11 @@
 K is the number of starts, N the number of cameras.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,11 +27,13 @@ STARTS_AT_ONCE = 64
 
 class Starts(NamedTuple):
     """K starts, tokenised: their frames, with the context of their episodes' first frames, the images
-    (K, N, 3, H, W) that these decode to, and K instructions."""
+    (K, N, 3, H, W) that these decode to, K instructions, and how their episodes began
+    (`StartImages.origins`)."""
 
     frames: Frames
     images: Tensor
     instructions: list[str]
+    origins: Mapping[str, np.ndarray]
 
     def __len__(self) -> int:
         return len(self.instructions)
@@ -72,7 +75,7 @@ def load_starts(
         depth=frames.depth(model),
         instruction_weights=model.instruction_weights(frames.instructions, len(state)),
     )
-    starts = Starts(start_frames, torch.cat(images), frames.instructions)
+    starts = Starts(start_frames, torch.cat(images), frames.instructions, frames.origins)
     if text_model is None:
         return starts, None
     begin = replace(begin, depth=frames.depth(text_model))

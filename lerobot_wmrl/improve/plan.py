@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 from lerobot.envs.utils import env_to_policy_features
-from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD, TRUNCATED
+from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD
 
 from lerobot_wmrl.common.checkpoints import best_model, last_model, resolved_path
 from lerobot_wmrl.common.constants import START_KIND, START_SEED
@@ -40,16 +40,7 @@ SLOWEST: Final = 2
 """A rollout may take this many times as long as the longest recorded episode: what a stuck one does beyond
 would fill the data."""
 
-ROLLOUT_COLUMNS: Final = (
-    *DEFAULT_FEATURES,
-    ACTION,
-    REWARD,
-    SUCCESS,
-    DONE,
-    TRUNCATED,
-    START_SEED,
-    START_KIND,
-)
+ROLLOUT_COLUMNS: Final = (*DEFAULT_FEATURES, ACTION, REWARD, SUCCESS, DONE, START_SEED, START_KIND)
 """Columns of recorded rollouts, beside those that the policy sees and the environment declares."""
 
 STRICT_DONE_FRAMES: Final = 2

@@ -26,7 +26,7 @@ VIEWS: Final = {
     "third_view": View((0.52, 0.0, 0.60), (0.0, -0.035, 0.035), 0.53),
     "side_view": View((0.0, 0.55, 0.42), (0.0, -0.035, 0.04), 0.6),
 }
-"""Name → fixed camera. `experiments/camera_probe.py` measures what can be read from their pictures."""
+"""Name → fixed camera. `experiments/steps/camera_probe.py` measures what can be read from their pictures."""
 
 WRIST: Final = "wrist"
 CAMERAS: Final = (*VIEWS, WRIST)

@@ -1,12 +1,16 @@
-"""lerobot-wmrl-resample: copy a dataset at a lower frame rate, every second frame of it, or every third.
+"""lerobot-wmrl-resample: copy a dataset at a lower frame rate, or without what follows success.
 
     lerobot-wmrl-resample --dataset.root=data/50hz --every=2 --output_dir=data/25hz
     lerobot-wmrl-resample --dataset.root=data/80hz --every=4 --displacements=[x,y,z] --output_dir=data/20hz
+    lerobot-wmrl-resample --dataset.root=data/labelled --every=1 --solved_frames=4 --output_dir=data/cut
 
 Frames that hardly differ cost as much to imagine as others. 500 frames at 50 Hz become 250 at 25 Hz. A frame
 that is kept gets the action that was sent last before the next one, or, of the components in
 `--displacements`, the sum of the actions in between. The rewards in between are added up, and a success in
 between counts. A policy for the new rate has to be trained on the copy, and acts at that rate.
+
+With `--solved_frames` a successful episode ends where it has shown the solved task for so many frames: a
+policy that is cloned from what follows learns to stand still.
 """
 
 import logging
@@ -17,7 +21,7 @@ from typing import Any, Final
 
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, REWARD
+from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, require_at_least
@@ -38,14 +42,16 @@ AFTER: Final = "next."
 
 @dataclass
 class ResampleConfig(RunConfig):
-    """Copy a dataset at a lower frame rate.
+    """Copy a dataset at a lower frame rate, or without what follows success.
 
     Args:
         dataset: the dataset to copy.
-        every: keep every second frame, third, …; must divide the dataset's frames a second.
+        every: keep every second frame, third, …; must divide the dataset's frames a second. 1 keeps all.
         displacements: the action's components that add up, such as changes of a position: their names, or
             numbers from 0 on where they have none. The others, such as targets and grippers, keep the last
             value.
+        solved_frames: frames of the copy in a row that show the solved task, after which an episode ends. One
+            that has not as many in a row is kept whole. By default nothing is cut off. Needs `next.success`.
         output_dir: folder of the copy.
         repo_id: its name, for the hub; by default `local/` and the folder's.
     """
@@ -53,6 +59,7 @@ class ResampleConfig(RunConfig):
     dataset: DatasetSource = field(default_factory=DatasetSource)
     every: int = 2
     displacements: list[str] = field(default_factory=list)
+    solved_frames: int | None = None
     output_dir: Path = Path("outputs/resampled")
     repo_id: str | None = None
 
@@ -63,7 +70,7 @@ def resample(cfg: ResampleConfig) -> None:
     table = read_episodes(dataset)
     check(cfg, dataset)
     summed = np.isin(component_names(dataset.features[ACTION]), cfg.displacements)
-    if absolute_control(table) is False and not summed.any():
+    if cfg.every > 1 and absolute_control(table) is False and not summed.any():
         logging.warning(
             "the actions do not follow the state: if they are displacements, name the components that add up "
             "with --displacements"
@@ -76,6 +83,7 @@ def resample(cfg: ResampleConfig) -> None:
     lines = [
         f"{cfg.output_dir}: {len(copied.length)} episodes, {copied.length.sum()} frames at "
         f"{copied.dataset.fps} Hz, the longest has {copied.length.max()}.",
+        *cut_lines(cfg, -(-table.length // cfg.every) - copied.length),
         *duration_lines([longest_run(each) for each in success] if labelled else []),
         f"Next: lerobot-train {flag_as_typed('dataset.root', cfg.output_dir)} …",
     ]
@@ -84,7 +92,16 @@ def resample(cfg: ResampleConfig) -> None:
 
 def check(cfg: ResampleConfig, dataset: LeRobotDataset) -> None:
     """Raise FieldError for a setting that cannot be, or a dataset that cannot be copied whole."""
-    require_at_least(cfg, 2, "every")
+    require_at_least(cfg, 1 if cfg.solved_frames else 2, "every")
+    if cfg.solved_frames is not None:
+        require_at_least(cfg, 1, "solved_frames")
+        if SUCCESS not in dataset.features:
+            raise FieldError(
+                "solved_frames",
+                cfg.solved_frames,
+                f"the dataset does not say in which frames the task is solved ({SUCCESS})",
+                "label it first (lerobot-wmrl-label)",
+            )
     if dataset.fps % cfg.every:
         raise FieldError(
             "every",
@@ -143,7 +160,7 @@ def write_resampled(dataset: LeRobotDataset, cfg: ResampleConfig, summed: np.nda
             rgb_encoder=encoder,
         )
         for episode in trange(dataset.num_episodes, unit="episode", desc="Copying"):
-            for row in episode_rows(dataset, episode, copy.features, cfg.every, summed):
+            for row in episode_rows(dataset, episode, copy.features, cfg, summed):
                 copy.add_frame(row)
             save_episode(copy)
         copy.finalize()
@@ -158,14 +175,42 @@ def scaled_features(features: Mapping[str, Any], summed: np.ndarray, every: int)
     return columns | {ACTION: columns[ACTION] | ({"info": info} if info else {})}
 
 
+def cut_lines(cfg: ResampleConfig, left_out: np.ndarray) -> list[str]:
+    """Say how much was cut off, of each episode so many frames of the copy. (E,)"""
+    if cfg.solved_frames is None:
+        return []
+    return [f"{(left_out > 0).sum()} episodes were cut, by {left_out.sum()} frames together."]
+
+
+def end_of(solved: np.ndarray, frames: int) -> int:
+    """Return after how many rows an episode has been solved for so many in a row; all rows if it never is.
+
+    solved: whether each row's action leads to a frame that shows the solved task. (T,)
+    """
+    held = np.convolve(solved.astype(int), np.ones(frames, int), "full")[: len(solved)]
+    ends = np.flatnonzero(held == frames)
+    return int(ends[0]) + 1 if len(ends) else len(solved)
+
+
 def episode_rows(
-    dataset: LeRobotDataset, episode: int, features: Mapping[str, Any], every: int, summed: np.ndarray
+    dataset: LeRobotDataset,
+    episode: int,
+    features: Mapping[str, Any],
+    cfg: ResampleConfig,
+    summed: np.ndarray,
 ) -> Iterator[dict[str, Any]]:
     """Yield the rows of an episode's copy, as LeRobotDataset's `add_frame` takes them."""
-    columns = kept_values(dataset, episode, features, every, summed)
-    begin = rows_of(dataset, episode).start
+    every, columns = cfg.every, kept_values(dataset, episode, features, cfg.every, summed)
+    begin, length = rows_of(dataset, episode).start, len(columns["task"])
+    if cfg.solved_frames is not None:
+        length = end_of(columns[SUCCESS].reshape(-1), cfg.solved_frames)
+    if DONE in columns and length < len(columns["task"]):
+        columns[DONE][length - 1] = True
     for part in row_parts(dataset, episode):  # the frames of a long episode would not fit into the memory
-        kept = [row for row in range(part.start, part.stop) if (row - begin) % every == 0]
+        rows = range(part.start, min(part.stop, begin + length * every))
+        kept = [row for row in rows if (row - begin) % every == 0]
+        if not kept:
+            return
         frames = {key: decode(dataset, episode, key, part) for key in dataset.meta.camera_keys}
         for row in kept:
             images = {key: each[row - part.start].permute(1, 2, 0).numpy() for key, each in frames.items()}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lerobot_wmrl.common.constants import TASK_NAMES
+from lerobot_wmrl.common.constants import START_SCENE, START_SEED, TASK_NAMES
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.start_frames import read_start_images
@@ -23,6 +23,8 @@ def test_they_are_what_the_simulator_shows(recwarn):
     found = read_start_images(source, config)
     assert found.images.shape == (4, 2, 32, 32, 3)
     assert found.tasks.tolist() == [TASK_NAMES.index(task) for task in ("push", "push", "pull", "pull")]
+    assert found.origins[START_SCENE].tolist() == [0, 2, 0, 2]
+    assert found.origins[START_SEED].tolist() == [0, 1, 2, 3]
     env = WmrlManiSkillEnv(task="pull", scenes=[0, 2], cameras=["third_view"], image_size=32)
     simulation = env.create_simulation()
     simulation.task = task_of("pull")

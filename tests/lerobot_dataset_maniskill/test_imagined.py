@@ -5,6 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
@@ -18,10 +20,13 @@ from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_wmrl.common.constants import KINDS, START_KIND, START_SCENE, START_SEED, START_TASK
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
+from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.envs.world_recording import require_same_actions
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
@@ -80,12 +85,35 @@ def test_every_row_is_what_the_world_model_imagined(config, small_dataset):
     assert np.array_equal(truncated, ends)
 
 
+def test_starts_of_several_tasks_come_in_the_order_of_the_dataset(config, make_synthetic_dataset, tmp_path):
+    root = make_synthetic_dataset(tmp_path / "tasks", episodes=6).root
+    (file,) = root.glob("data/**/*.parquet")
+    table = pq.read_table(file)
+    index = table.schema.get_field_index("start.task")
+    of_two = pa.array(np.array(table["episode_index"]) // 4)  # four episodes of one task, two of another
+    pq.write_table(table.set_column(index, table.schema.field(index), of_two), file)
+    config.env.dataset.root, config.video = str(root), False
+    record(config)
+    imagined, real = read_episodes(open_dataset(config.root)), read_episodes(open_dataset(root))
+    begun = [index % 6 for index in range(7)]
+    for name in (START_SEED, START_SCENE, START_TASK):
+        assert imagined.columns[name].tolist() == real.columns[name][begun].tolist()
+    assert np.allclose(imagined.state[imagined.start], real.state[real.start][begun], atol=1e-5)
+
+
 def test_they_can_be_merged_with_the_dataset_that_they_begin_in(config, small_dataset, tmp_path):
     config.like, config.num_episodes = DatasetSource(str(small_dataset.root)), 2
     record(config)
     merge_folders([Path(small_dataset.root), config.root], tmp_path / "merged", "local/merged")
     merged = read_episodes(open_dataset(tmp_path / "merged"))
     assert merged.columns[START_SEED][-2:].tolist() == merged.columns[START_SEED][:2].tolist()
+
+
+@pytest.mark.parametrize("changed", [{"action_high": [0.5] * 7}, {"action_names": list("abcdefg")}])
+def test_columns_of_another_robot_are_refused(small_dataset, changed):
+    robot = replace(read_embodiment(small_dataset.meta, Embodiment()), **changed)
+    with pytest.raises(FieldError, match=r"^like\.root=.*its actions are .*, those of the world model "):
+        require_same_actions(small_dataset.meta, robot)
 
 
 def test_published_they_say_that_they_are_imagined(config, hub):

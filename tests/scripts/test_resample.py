@@ -15,7 +15,7 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data import decoding
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
-from lerobot_wmrl.scripts.resample import ResampleConfig, check, main
+from lerobot_wmrl.scripts.resample import ResampleConfig, check, end_of, main
 
 LENGTHS, FPS, SIDE = (7, 4), 50, 8
 CAMERA = "observation.images.top"
@@ -94,6 +94,36 @@ def test_what_happened_between_two_kept_frames_belongs_to_the_first(
     assert np.ravel(rows["next.reward"]).tolist() == [2, 2, 2, 1, 2, 2]
     assert [round(float(dataset[row][CAMERA].mean()) * 255) for row in range(4)] == [0, 40, 80, 120]
     assert dataset.features["action"]["info"] == {"low": [-2, 0], "high": [2, 500]}
+
+
+def test_what_follows_success_is_cut_off(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Frame 3 alone is solved: of seven frames four are left, and four of four."""
+    cut = tmp_path / "cut"
+    monkeypatch.setattr(decoding, "DECODED", 3)
+    resample(monkeypatch, f"--dataset.root={source}", "--every=1", "--solved_frames=1", f"--output_dir={cut}")
+    said = capsys.readouterr()
+    assert "1 episodes were cut, by 3 frames together" in said.out
+    assert "do not follow the state" not in said.err
+    dataset = open_dataset(cut)
+    assert (dataset.fps, read_episodes(dataset).length.tolist()) == (FPS, [4, 4])
+    rows = dataset.hf_dataset.with_format("numpy")
+    assert np.ravel(rows["next.done"]).tolist() == [0, 0, 0, 1, 0, 0, 0, 1]
+    assert np.ravel(rows["next.success"]).tolist() == [False, False, False, True] * 2
+    assert [round(float(dataset[row][CAMERA].mean()) * 255) for row in range(4)] == [0, 20, 40, 60]
+
+
+@pytest.mark.parametrize(("frames", "rows"), [(1, 2), (2, 6), (3, 7), (4, 8)])
+def test_an_episode_ends_after_so_many_solved_frames_in_a_row(frames: int, rows: int) -> None:
+    """One that has not as many is kept whole."""
+    assert end_of(np.array([0, 1, 0, 0, 1, 1, 1, 0], bool), frames) == rows
+
+
+def test_episodes_without_labels_are_not_cut(source: Path, tmp_path: Path) -> None:
+    bare = remove_feature(open_dataset(source), "next.success", output_dir=tmp_path / "bare")
+    with pytest.raises(FieldError, match=r"^solved_frames=4: .*label it first"):
+        check(ResampleConfig(output_dir=tmp_path / "cut", every=1, solved_frames=4), bare)
 
 
 def test_episodes_that_only_end_are_no_successes(
