@@ -234,7 +234,7 @@ def test_the_readme_says_what_else_was_measured() -> None:
     known, unseen = (
         in_percent(gate[scenes]["false_positive_rate"]["share"]) for scenes in ("known", "unseen")
     )
-    assert f"success for {known} % of failures in known and {unseen} % in unseen scenes" in text
+    assert f"takes {known}/{unseen} % of failures for successes" in text
 
 
 def test_the_objections_say_what_was_measured() -> None:

@@ -257,7 +257,8 @@ def one_sided_tasks(table: EpisodeTable) -> list[str]:
     )
     return [
         f"instructions: {len(outcomes)}, by which success is told; {counts}. What each asks for is "
-        "learnt from its own episodes: record some of both outcomes"
+        "learnt from its own episodes: record some of both outcomes, or, if these are one task in several "
+        "wordings, give it one (lerobot-edit-dataset --operation.type=modify_tasks)"
     ]
 
 

@@ -87,8 +87,8 @@ def choice_line(progress: Progress) -> str:
     path = progress.policies[chosen]
     if choice is None:
         return (
-            f"The last policy: {chosen}, {path}. RL can make a policy worse: the comparison says "
-            "whether to use it."
+            f"The last policy: {chosen}, {path}. RL can make a policy worse: compare it with those before "
+            "before you use it."
         )
     shown = ", ".join(f"{title} {rate}" for title, rate in choice.rates.items())
     return (
@@ -152,7 +152,8 @@ def reservations(progress: Progress) -> list[str]:
     if plan.config.real_env is None:
         notes.append(
             "This is what the world model predicts, and shows nothing about the real world. Run the policies "
-            "there, label what they did, and run the command again on all episodes."
+            "there, label what they did, and run the command again on all episodes, with the better policy "
+            "as --policy.path and another --output_dir."
         )
     if reason := read_record(plan.out, StageName.RL).get(FAILED):
         kept = progress.has_trained and not progress.kept_start
