@@ -19,6 +19,7 @@ from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.demo.stages import Demo, DemoConfig
+from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET
 from lerobot_wmrl.improve.progress import CLONED, DISTILLED, PPO, SFT
 
 ROOT = Path(__file__).parents[2]
@@ -183,3 +184,33 @@ def test_the_page_stands_alone_and_shows_every_part(outputs: tuple[Path, str]) -
     seconds = [stage_record(demo, name)["seconds"] for name in STAGES]
     assert summary["seconds"] == pytest.approx(sum(seconds)), "those of the improvement are within its stage"
     assert "The report: demo/report.html" in printed
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        {"seed": -1},
+        {"seed": 10},
+        {"eval_episodes": 0},
+        {"rollouts": 0},
+        {"rollouts": 50_001},
+        {"rollouts": 11, "demonstrations": 8},
+    ],
+)
+def test_impossible_settings_are_named(flags: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(flags))}="):
+        DemoConfig(**flags).validate()
+
+
+def test_training_and_evaluation_seeds_are_disjoint(tmp_path: Path) -> None:
+    """Whatever the demo's seed, at a distance that no stage's number of episodes bridges."""
+    trained = set()
+    for seed in range(10):
+        for stage in Demo(DemoConfig(tmp_path, seed)).stages():
+            if stage.name not in ("unseen", "imagined"):  # they need a dataset, and have the evaluation's
+                seeds = [
+                    int(flag.partition("=")[2]) for flag in stage.command() if flag.startswith("--seed=")
+                ]
+                trained.update(seeds)
+    assert trained == {100_000 * seed for seed in range(10)}
+    assert EVALUATION_SEED - max(trained) >= 2 * ROLLOUT_SEED_OFFSET
