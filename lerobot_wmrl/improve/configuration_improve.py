@@ -54,6 +54,9 @@ class ImproveConfig(RunConfig):
             Settings of its own hold for all stages, such as `--policy.n_action_steps=8` for ACT.
         dataset: `--dataset.repo_id=USER/NAME` or `--dataset.root=FOLDER`: episodes with actions, the cameras
             that the policy sees, and next.success. Failures belong into it.
+        check: `--check.root=FOLDER` or `--check.repo_id=USER/NAME`: labelled episodes that are not in
+            `dataset`, rollouts of the policy at best, to check the world model on; some succeed and some
+            fail. By default held-out episodes of the dataset, or all of it where these are few.
         real_env: `--real_env.type=…` and its settings: one of LeRobot's environments or wmrl_maniskill, to
             record rollouts and to measure success in.
         rollouts: rollouts of the policy that are recorded in `real_env` first, and learnt from. Columns of
@@ -79,6 +82,7 @@ class ImproveConfig(RunConfig):
 
     policy: PreTrainedConfig | None = None
     dataset: ChosenEpisodes = field(default_factory=ChosenEpisodes)
+    check: ChosenEpisodes = field(default_factory=ChosenEpisodes)
     real_env: EnvConfig | None = None
     rollouts: int = 0
     exploration: float = 0.2

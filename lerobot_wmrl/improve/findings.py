@@ -116,6 +116,41 @@ def require_mergeable(dataset: LeRobotDataset, env: WmrlManiSkillEnv) -> None:
         )
 
 
+def require_checkable(check: EpisodeTable, episodes: Sequence[int] | None, learnt: EpisodeTable) -> None:
+    """Raise FieldError unless a world model that learns from one dataset can be checked on these episodes of
+    another."""
+    wanted = {
+        name: feature
+        for name, feature in learnt.dataset.features.items()
+        if name in (ACTION, OBS_STATE) or shows_colours(feature)
+    }
+    for name, feature in wanted.items():
+        found = check.dataset.features.get(name, {})
+        needed, has = ([each.get(key) for key in ("shape", "names")] for each in (feature, found))
+        if [*map(str, needed)] != [*map(str, has)]:
+            raise FieldError(
+                "dataset.root",
+                check.dataset.root,
+                f"has {name} as {has}, the dataset that is learnt from as {needed} (shape, names)",
+                "give rollouts of the same robot with the same cameras",
+            )
+    if check.dataset.fps != learnt.dataset.fps:
+        raise FieldError(
+            "dataset.root",
+            check.dataset.root,
+            f"has {check.dataset.fps} frames a second, the dataset that is learnt from {learnt.dataset.fps}",
+            "give rollouts at the same rate",
+        )
+    success = check.success[check.among(episodes)]
+    if not tell_apart(success):
+        raise FieldError(
+            "dataset.root",
+            check.dataset.root,
+            f"of its episodes {success.sum()} succeed and {(~success).sum()} fail, and a check needs both",
+            "give labelled rollouts, failures among them",
+        )
+
+
 def require_improvable(
     table: EpisodeTable, policy: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]]
 ) -> None:

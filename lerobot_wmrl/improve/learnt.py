@@ -76,10 +76,13 @@ class LearntEpisodes:
     def checked(self) -> tuple[Flags, str]:
         """Return the flags of the dataset that the world model is checked on, and its split.
 
-        Held-out episodes are better than others, and rollouts better than the dataset: the policy that is
-        trained will act like them. But they must both succeed and fail, if any do.
+        Those that were given for it come first. Held-out episodes are better than others, and rollouts better
+        than the dataset: the policy that is trained will act like them. But they must both succeed and fail,
+        if any do.
         """
         config, findings = self.plan.config, self.plan.findings
+        if config.check.given:
+            return config.check.flags(), "all"
         dataset, holds_out = config.dataset.flags(), findings.held_out >= ENOUGH_HELD_OUT
         numbers = list(self.plan.rollout_numbers())
         rollouts = replace(self.plan.data, episodes=numbers).flags()

@@ -12,6 +12,7 @@ from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD
 
 from lerobot_wmrl.common.checkpoints import best_model, last_model, resolved_path
 from lerobot_wmrl.common.constants import START_KIND, START_SEED
+from lerobot_wmrl.common.errors import renamed
 from lerobot_wmrl.common.flags import Flags
 from lerobot_wmrl.common.forks import in_fork
 from lerobot_wmrl.common.policies import copy_checkpoint, load_processors
@@ -22,7 +23,13 @@ from lerobot_wmrl.data.episodes import SUCCESS, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.lerobot_env import check_frame_rate, check_real_env
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
-from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, inspect_dataset, require_mergeable
+from lerobot_wmrl.improve.findings import (
+    LONGEST_IMAGINATION,
+    Findings,
+    inspect_dataset,
+    require_checkable,
+    require_mergeable,
+)
 from lerobot_wmrl.improve.own_cameras import with_own_cameras, without_renaming
 from lerobot_wmrl.improve.sizes import Sizes
 from lerobot_wmrl.improve.stage_names import StageName
@@ -82,6 +89,9 @@ class Plan:
         require_unreported(table, chosen, "choose others with `dataset.episodes`")
         if config.rollouts and isinstance(config.real_env, WmrlManiSkillEnv):
             require_mergeable(table.dataset, config.real_env)
+        if config.check.given:
+            with renamed("dataset", "check"):
+                require_checkable(read_episodes(config.check.open()), config.check.episodes, table)
         robot = read_embodiment(table.dataset.meta, Embodiment())
         check_units(
             policy,

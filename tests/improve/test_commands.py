@@ -27,7 +27,13 @@ from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve import commands, learnt
-from lerobot_wmrl.improve.findings import few_decisions, inspect_dataset, one_sided_tasks, usual_length
+from lerobot_wmrl.improve.findings import (
+    few_decisions,
+    inspect_dataset,
+    one_sided_tasks,
+    require_checkable,
+    usual_length,
+)
 from lerobot_wmrl.improve.plan import Plan
 from lerobot_wmrl.improve.progress import CLONED, DISTILLED, FITTED, PPO, SFT, Progress
 from lerobot_wmrl.improve.report.words import reservations
@@ -205,6 +211,25 @@ def test_the_check_takes_failures_wherever_they_are(
     """Successes alone say nothing of false positives."""
     found = {"held_out": 10, "held_out_tell": tell, "failures": failures}
     assert improvement_of(tmp_path, **found).learnt.checked() == ({"dataset.root": "data"}, split)
+
+
+def test_the_check_takes_the_episodes_that_are_given_for_it(tmp_path: Path) -> None:
+    improvement = improvement_of(tmp_path, held_out=200, held_out_tell=True, failures=19)
+    improvement.plan.config.check = ChosenEpisodes("kept", episodes=[1, 2])
+    (command,) = commands_of(improvement, "check").values()
+    assert {"--dataset.root=kept", "--dataset.episodes=[1,2]", "--split=all"} <= {*command}
+
+
+def test_episodes_to_check_on_are_looked_at_before_anything_is_trained(
+    make_synthetic_dataset: Any, small_dataset: Any, tmp_path: Path
+) -> None:
+    table = read_episodes(small_dataset)
+    require_checkable(table, None, table)
+    with pytest.raises(FieldError, match=r"of its episodes 2 succeed and 0 fail, and a check needs both"):
+        require_checkable(table, [0, 1], table)
+    large = read_episodes(make_synthetic_dataset(tmp_path / "large", size=48))
+    with pytest.raises(FieldError, match=r"has observation.images.third_view as \[\(48, 48, 3\)"):
+        require_checkable(large, None, table)
 
 
 BOTH, EARLY, NEITHER = "both outcomes", "both, but held-out successes alone", "successes alone"

@@ -19,6 +19,7 @@ from PIL import Image
 
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.tracking import append_metrics
+from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 from lerobot_wmrl.improve import commands
@@ -380,3 +381,6 @@ def test_the_report_says_that_success_was_taken_for_less(tmp_path: Path) -> None
     assert "`--size=cpu` has larger frames" in said
     assert "larger" not in trust(improvement_of(tmp_path, frame_side=64))
     assert "On 13 rollouts (most of which it has learnt from): false" in said
+    improvement = improvement_of(tmp_path)
+    improvement.plan.config.check = ChosenEpisodes("data/kept")
+    assert "On 13 episodes of data/kept: false" in trust(improvement)

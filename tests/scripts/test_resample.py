@@ -15,6 +15,7 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data import decoding
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.scripts import resample as command
 from lerobot_wmrl.scripts.resample import ResampleConfig, check, end_of, main
 
 LENGTHS, FPS, SIDE = (7, 4), 50, 8
@@ -97,15 +98,19 @@ def test_what_happened_between_two_kept_frames_belongs_to_the_first(
 
 
 def test_what_follows_success_is_cut_off(
-    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    source: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """Frame 3 alone is solved: of seven frames four are left, and four of four."""
+    """Frame 3 alone is solved: of seven frames four are left, and four of four. No action adds up."""
     cut = tmp_path / "cut"
+    monkeypatch.setattr(command, "absolute_control", lambda table: False)
     monkeypatch.setattr(decoding, "DECODED", 3)
     resample(monkeypatch, f"--dataset.root={source}", "--every=1", "--solved_frames=1", f"--output_dir={cut}")
-    said = capsys.readouterr()
-    assert "1 episodes were cut, by 3 frames together" in said.out
-    assert "do not follow the state" not in said.err
+    assert "1 episodes were cut, by 3 frames together" in capsys.readouterr().out
+    assert "do not follow the state" not in caplog.text
     dataset = open_dataset(cut)
     assert (dataset.fps, read_episodes(dataset).length.tolist()) == (FPS, [4, 4])
     rows = dataset.hf_dataset.with_format("numpy")

@@ -192,6 +192,8 @@ def trust(progress: Progress) -> str:
     whose = "rollouts" if Path(check["dataset"]) == progress.plan.folder(StageName.MERGED) else "episodes"
     held_out = check["split"] == "validation"
     kind = f"held-out {whose}" if held_out else f"{whose} (most of which it has learnt from)"
+    if progress.plan.config.check.given:
+        kind = f"episodes of {progress.plan.config.check.name}"
     if not wins or not losses:
         return (
             f"Unknown: of the {kind} {wins} succeed and {losses} fail, and both are needed. Record more."
