@@ -218,6 +218,7 @@ def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, t
         (["--seed=1000000"], "--seed=1000000: must be from 0 to 999999"),
         (["--size=huge"], "--size=huge: choose one of auto, tiny, demo, cpu"),
         (["--dataset.root=nowhere"], "no LeRobotDataset there"),
+        (["--check.root=nowhere"], "--check.root=nowhere: no LeRobotDataset there"),
         (
             ["--real_env.type=wmrl_maniskill"],
             "the policy needs observation.image, which real_env does not have",

@@ -231,6 +231,9 @@ def test_an_interrupted_recording_continues_and_a_whole_one_is_left_alone(
     config.exploration = 0.5
     with pytest.raises(ValueError, match=r"other settings \(exploration 0\.0 → 0\.5\)"):
         record(config)
+    config.exploration, config.like = 0.0, DatasetSource()
+    with pytest.raises(ValueError, match=r"other settings \(like .* → "):
+        record(config)
 
 
 def test_where_resets_choose_the_start_none_comes_twice(
