@@ -232,7 +232,7 @@ def test_an_interrupted_recording_continues_and_a_whole_one_is_left_alone(
     with pytest.raises(ValueError, match=r"other settings \(exploration 0\.0 → 0\.5\)"):
         record(config)
     config.exploration, config.like = 0.0, DatasetSource()
-    with pytest.raises(ValueError, match=r"other settings \(like .* → "):
+    with pytest.raises(ValueError, match=r"other settings \(like\.root .* → "):
         record(config)
 
 
