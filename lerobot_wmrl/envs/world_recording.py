@@ -70,12 +70,10 @@ def require_same_actions(like: Any, robot: Embodiment) -> None:
     own = (robot.action_low, robot.action_high)
     if names == robot.action_names and (limits is None or np.allclose(limits, own)):
         return
-    stated = Embodiment(action_names=names, action_low=list(own[0]), action_high=list(own[1]))
-    if limits is not None and len(names) == len(robot.action_names):
-        stated = Embodiment(action_names=names, action_low=list(limits[0]), action_high=list(limits[1]))
+    ends = "" if limits is None else f" (from {list(limits[0])} to {list(limits[1])})"
     raise FieldError(
         "like.root",
         like.root,
-        f"its actions are {stated.range_text()}, those of the world model {robot.range_text()}",
+        f"its actions are {', '.join(names)}{ends}, those of the world model {robot.range_text()}",
         "give a dataset of the same robot, or `like_columns=false` if nothing is to be merged",
     )

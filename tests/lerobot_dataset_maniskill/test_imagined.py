@@ -109,7 +109,10 @@ def test_they_can_be_merged_with_the_dataset_that_they_begin_in(config, small_da
     assert merged.columns[START_SEED][-2:].tolist() == merged.columns[START_SEED][:2].tolist()
 
 
-@pytest.mark.parametrize("changed", [{"action_high": [0.5] * 7}, {"action_names": list("abcdefg")}])
+FEWER = {"action_names": ["x", "y"], "action_low": [-1.0, -1.0], "action_high": [1.0, 1.0]}
+
+
+@pytest.mark.parametrize("changed", [{"action_high": [0.5] * 7}, {"action_names": list("abcdefg")}, FEWER])
 def test_columns_of_another_robot_are_refused(small_dataset, changed):
     robot = replace(read_embodiment(small_dataset.meta, Embodiment()), **changed)
     with pytest.raises(FieldError, match=r"^like\.root=.*its actions are .*, those of the world model "):
