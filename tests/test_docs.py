@@ -177,7 +177,7 @@ def test_the_readme_s_table_says_what_was_measured() -> None:
     pull = [cell for cell in read_all("value_tasks") if cell["task"] == "pull"]
     shown = [mean_success(pull, name) for name in (best_bc(pull), "imagined_ppo", "ppo_distilled")]
     assert f"| [pull](docs/results.md#value_tasks), `cnn` | 8 + 300 | {len(pull)} | {shown[0]} | – |" in text
-    assert f"| 1 | {shown[0]} | – | {shown[1]} | {shown[2]} |" in text
+    assert f"| {len(pull)} | {shown[0]} | – | {shown[1]} | {shown[2]} |" in text
     act = read_all("value_act")
     bc, ppo, distilled = (
         mean_success(act, name) for name in ("longer_filtered", "imagined_ppo", "distilled")
