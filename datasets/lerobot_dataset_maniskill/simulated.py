@@ -15,10 +15,9 @@ from lerobot_dataset_maniskill.merging import describe, recorded_settings
 from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
 from lerobot_wmrl.common.actions import warn_of_clipped
 from lerobot_wmrl.common.constants import KINDS
-from lerobot_wmrl.common.policy_checks import fit_to_environment
 from lerobot_wmrl.data.ledger import spending
+from lerobot_wmrl.envs.lerobot_env import check_fit_to
 from lerobot_wmrl.maniskill.backend import render_backend, simulating_context
-from lerobot_wmrl.maniskill.embodiment import ACTION_NAMES
 
 POLL_SECONDS: Final = 1.0
 GRACE_SECONDS: Final = 10.0
@@ -44,8 +43,7 @@ class ManiSkillEpisodes:
         """Raise ValueError unless there is a renderer, and the cameras show what the policy needs."""
         render_backend()
         if self.config.policy is not None:
-            shapes = self.config.maniskill.observation_shapes()
-            fit_to_environment(self.config.policy, shapes, len(ACTION_NAMES))
+            check_fit_to(self.config.maniskill, self.config.policy)
 
     def record(self, work: Path, missing: Sequence[str]) -> None:
         """Record the missing parts, in this process or in several."""

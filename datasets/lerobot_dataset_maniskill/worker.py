@@ -127,13 +127,13 @@ Report = Callable[[EpisodeResult], None]
 
 
 @contextmanager
-def whole_part(
-    config: RecordConfig, folder: Path, part: DatasetPart, cameras: Sequence[str], image_size: int
-) -> Iterator[LeRobotDataset]:
+def whole_part(config: RecordConfig, folder: Path, part: DatasetPart) -> Iterator[LeRobotDataset]:
     """Yield an empty dataset to fill; unless an error is raised, move it to `folder` as the part."""
-    partial = folder / f".{part.name}.{os.getpid()}.partial"
+    env, partial = config.maniskill, folder / f".{part.name}.{os.getpid()}.partial"
     shutil.rmtree(partial, ignore_errors=True)
-    dataset = create_dataset(partial, config.dataset_id, cameras, image_size, config.depth, config.video)
+    dataset = create_dataset(
+        partial, config.dataset_id, env.cameras, env.image_size, config.depth, config.video
+    )
     yield dataset
     dataset.finalize()
     partial.replace(folder / part.name)
@@ -154,8 +154,7 @@ class PartRecorder:
 
     def record(self, part: DatasetPart, report: Report) -> None:
         """Record a part. Its folder appears under its final name only when it is whole."""
-        env = self.config.maniskill
-        with whole_part(self.config, self.folder, part, env.cameras, env.image_size) as dataset:
+        with whole_part(self.config, self.folder, part) as dataset:
             for plan in part.episodes:
                 success = self._record_episode(dataset, plan)
                 report(EpisodeResult(plan.kind, success, self.controller.clipped))

@@ -15,7 +15,7 @@ from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.scripts.lerobot_eval import rollout
-from lerobot.utils.constants import ACTION, OBS_IMAGE
+from lerobot.utils.constants import ACTION, OBS_IMAGE, TRUNCATED
 from lerobot.utils.random_utils import seeded_context
 from torch import Tensor
 
@@ -209,6 +209,7 @@ class RolloutRecorder:
         success = bool(taken["success"][row, length - 1])
         labelled = "next.success" in dataset.features  # else next.done is taken for it
         hold = self.world.done_frames if self.world else 1
+        begun = {START_SEED: np.array([seed]), **(self.world.begun(seed) if self.world else {})}
         for step in range(length):
             observation = recording.observations[step]
             frame: dict[str, Any] = observation_row(observation, row)
@@ -218,12 +219,8 @@ class RolloutRecorder:
                 "next.reward": np.array([float(taken["reward"][row, step])], np.float32),
                 "next.success": np.array([solved]),
                 "next.done": np.array([step == length - 1 if labelled else solved]),
-                START_SEED: np.array([seed]),
-                **(
-                    self.world.columns(seed, truncated=step == length - 1 and not success)
-                    if self.world
-                    else {}
-                ),
+                TRUNCATED: np.array([step == length - 1 and not success]),  # a column in world models alone
+                **begun,
                 START_KIND: np.array([KINDS.index(POLICY)]),
             }
             kept = row_in(dataset.features, frame)

@@ -35,7 +35,6 @@ from lerobot_wmrl.world_models.modeling_world_model import WorldModelRewardModel
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 """Its multiples, modulo 1, are spread over the unit interval, any of them in a row."""
 
-
 ORIGINS = START_TASK, START_SCENE, START_SEED
 """Columns that say how a recorded episode began."""
 
@@ -306,10 +305,8 @@ def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> Star
     simulation = env.create_simulation()
     frames, instructions, begun = [], [], []
     for seed in range(source.resets):
-        simulation.task, scene = (
-            task_of(tasks[seed // len(scenes) % len(tasks)]),
-            scene_for_seed(scenes, seed),
-        )
+        simulation.task = task_of(tasks[seed // len(scenes) % len(tasks)])
+        scene = scene_for_seed(scenes, seed)
         frames.append(simulation.reset(scene, seed))
         instructions.append(simulation.instruction)
         begun.append((simulation.task.index, scene.index, seed))

@@ -58,10 +58,9 @@ class World:
         flag, whole = ({"dtype": kind, "shape": (1,), "names": None} for kind in ("bool", "int64"))
         return {TRUNCATED: flag, **dict.fromkeys(self.origins, whole)}
 
-    def columns(self, seed: int, truncated: bool) -> dict[str, np.ndarray]:
-        """Return these columns in a row of the episode of a seed. (1,) each"""
-        begun = {name: values[[seed % self.starts]] for name, values in self.origins.items()}
-        return {TRUNCATED: np.array([truncated]), **begun}
+    def begun(self, seed: int) -> dict[str, np.ndarray]:
+        """Return the origins of the start in which the episode of a seed begins. (1,) each"""
+        return {name: values[[seed % self.starts]] for name, values in self.origins.items()}
 
 
 def require_same_actions(like: Any, robot: Embodiment) -> None:

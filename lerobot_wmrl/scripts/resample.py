@@ -28,6 +28,7 @@ from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.files import require_new, whole_folder, writing
 from lerobot_wmrl.common.flags import flag_as_typed
 from lerobot_wmrl.common.lerobot_commands import edit_advice
+from lerobot_wmrl.common.success_criterion import first_run
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset, save_episode
 from lerobot_wmrl.data.decoding import decode, row_parts, rows_of
 from lerobot_wmrl.data.embodiment import component_names
@@ -187,9 +188,8 @@ def end_of(solved: np.ndarray, frames: int) -> int:
 
     solved: whether each row's action leads to a frame that shows the solved task. (T,)
     """
-    held = np.convolve(solved.astype(int), np.ones(frames, int), "full")[: len(solved)]
-    ends = np.flatnonzero(held == frames)
-    return int(ends[0]) + 1 if len(ends) else len(solved)
+    (begin,) = first_run(solved[None], frames).tolist()
+    return len(solved) if begin < 0 else begin + frames
 
 
 def episode_rows(

@@ -3,7 +3,6 @@
 import multiprocessing
 import os
 import signal
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,18 +13,13 @@ from lerobot.configs import parser
 from lerobot_wmrl.common import forks
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.forks import entry_point, in_fork, run_measured, tree_memory
-
-
-def run_code() -> None:
-    """What the tests' command does: `python CODE`, in the process forked for it."""
-    exec(sys.argv[1], {})
+from tests.forked import code_for_commands
 
 
 @pytest.fixture(autouse=True)
 def commands_of_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     """Code that takes a moment stands for commands; it needs no GPU."""
-    monkeypatch.setattr(forks, "entry_point", lambda program: run_code)
-    monkeypatch.setattr(forks.torch.cuda, "is_available", lambda: False)
+    code_for_commands(monkeypatch)
 
 
 def test_output_and_memory_are_kept(tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]) -> None:

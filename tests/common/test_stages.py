@@ -1,28 +1,22 @@
 """The runner of the stages, on commands that take a moment: resuming, ending, refusing."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from lerobot_wmrl.common import forks, stages
+from lerobot_wmrl.common import stages
 from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.lerobot_commands import edit_command, train_command
 from lerobot_wmrl.common.stages import Stage, StageError, read_record, run_stages
-
-
-def run_code() -> None:
-    """What the test stages' command does: `python CODE`, in the process forked for it."""
-    exec(sys.argv[1], {})
+from tests.forked import code_for_commands
 
 
 @pytest.fixture(autouse=True)
 def commands_of_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     """Code that takes a moment stands for commands; it needs no preloaded library and no GPU."""
-    monkeypatch.setattr(forks, "entry_point", lambda program: run_code)
-    monkeypatch.setattr(forks.torch.cuda, "is_available", lambda: False)
+    code_for_commands(monkeypatch)
     monkeypatch.setattr(stages, "preload", lambda modules, offline: None)
 
 

@@ -87,8 +87,8 @@ def choice_line(progress: Progress) -> str:
     path = progress.policies[chosen]
     if choice is None:
         return (
-            f"The last policy: {chosen}, {path}. RL can make a policy worse: compare it with those before "
-            "before you use it."
+            f"The last policy: {chosen}, {path}. RL can make a policy worse: compare it with the earlier "
+            "ones before you use it."
         )
     shown = ", ".join(f"{title} {rate}" for title, rate in choice.rates.items())
     return (
@@ -191,9 +191,10 @@ def trust(progress: Progress) -> str:
     wins, losses = check["successes"], check["failures"]
     whose = "rollouts" if Path(check["dataset"]) == progress.plan.folder(StageName.MERGED) else "episodes"
     held_out = check["split"] == "validation"
-    kind = f"held-out {whose}" if held_out else f"{whose} (most of which it has learnt from)"
     if progress.plan.config.check.given:
         kind = f"episodes of {progress.plan.config.check.name}"
+    else:
+        kind = f"held-out {whose}" if held_out else f"{whose} (most of which it has learnt from)"
     if not wins or not losses:
         return (
             f"Unknown: of the {kind} {wins} succeed and {losses} fail, and both are needed. Record more."
