@@ -208,12 +208,12 @@ def check_range(
 def check_same_robot(embodiment: Embodiment, meta: Any) -> None:
     """Raise FieldError if a dataset shows another robot, or another frame rate, than a world model learnt.
 
-    Names that are numbers say nothing and are not compared.
+    Names that are numbers say nothing: of them, only how many there are is compared.
     """
     for column, names in ((ACTION, embodiment.action_names), (OBS_STATE, embodiment.state_names)):
         parts = component_names(meta.features[column]) if column in meta.features else []
         unnamed = any(each.isdecimal() for each in (*parts[:1], *names[:1]))
-        if names and parts and not unnamed and names != parts:
+        if names and parts and (len(names) != len(parts) if unnamed else names != parts):
             raise FieldError(
                 "dataset.root",
                 meta.root,

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from lerobot.utils.constants import ACTION, TRUNCATED
 
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, renamed
 from lerobot_wmrl.common.policies import LoadedPolicy
-from lerobot_wmrl.data.embodiment import Embodiment, component_names, recorded_range
+from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot, recorded_range
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 
 
@@ -44,7 +44,9 @@ class World:
         imagination.accept(policy)
         robot = imagination.model.config.embodiment
         if like is not None:
-            require_same_actions(like, robot)
+            with renamed("dataset", "like"):
+                check_same_robot(robot, like)
+                check_same_range(robot, like)
         return cls(
             robot,
             config.done_frames,
@@ -63,16 +65,15 @@ class World:
         return {name: values[[seed % self.starts]] for name, values in self.origins.items()}
 
 
-def require_same_actions(like: Any, robot: Embodiment) -> None:
-    """Raise FieldError if a dataset (its metadata) names other actions than a robot has, or another range."""
-    names, limits = component_names(like.features[ACTION]), recorded_range(like.features[ACTION])
-    own = (robot.action_low, robot.action_high)
-    if names == robot.action_names and (limits is None or np.allclose(limits, own)):
+def check_same_range(robot: Embodiment, meta: Any) -> None:
+    """Raise FieldError if a dataset says that its actions have another range than a robot's."""
+    limits = recorded_range(meta.features[ACTION])
+    if limits is None or np.allclose(limits, (robot.action_low, robot.action_high)):
         return
-    ends = "" if limits is None else f" (from {list(limits[0])} to {list(limits[1])})"
+    low, high = ([float(f"{value:.4g}") for value in ends] for ends in limits)
     raise FieldError(
-        "like.root",
-        like.root,
-        f"its actions are {', '.join(names)}{ends}, those of the world model {robot.range_text()}",
-        "give a dataset of the same robot, or `like_columns=false` if nothing is to be merged",
+        "dataset.root",
+        meta.root,
+        f"its actions range from {low} to {high}, those of the world model: {robot.range_text()}",
+        "use a dataset of the same robot, or `like_columns=false` if nothing is to be merged",
     )

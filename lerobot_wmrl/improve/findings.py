@@ -16,12 +16,14 @@ from lerobot_wmrl.common.lerobot_commands import edit_advice
 from lerobot_wmrl.common.policy_checks import check_fit
 from lerobot_wmrl.data.checks import (
     camera_names,
+    check_cameras,
+    check_widths,
     frame_size,
     require_shown,
     shows_colours,
     solved_from_the_start,
 )
-from lerobot_wmrl.data.embodiment import component_names
+from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot, component_names
 from lerobot_wmrl.data.episodes import EpisodeTable, count_tasks, success_column
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
@@ -116,31 +118,16 @@ def require_mergeable(dataset: LeRobotDataset, env: WmrlManiSkillEnv) -> None:
         )
 
 
-def require_checkable(check: EpisodeTable, episodes: Sequence[int] | None, learnt: EpisodeTable) -> None:
+def require_checkable(
+    check: EpisodeTable, episodes: Sequence[int] | None, learnt: EpisodeTable, robot: Embodiment
+) -> None:
     """Raise FieldError unless a world model that learns from one dataset can be checked on these episodes of
-    another."""
-    wanted = {
-        name: feature
-        for name, feature in learnt.dataset.features.items()
-        if name in (ACTION, OBS_STATE) or shows_colours(feature)
-    }
-    for name, feature in wanted.items():
-        found = check.dataset.features.get(name, {})
-        needed, has = ([each.get(key) for key in ("shape", "names")] for each in (feature, found))
-        if [*map(str, needed)] != [*map(str, has)]:
-            raise FieldError(
-                "dataset.root",
-                check.dataset.root,
-                f"has {name} as {has}, the dataset that is learnt from as {needed} (shape, names)",
-                "give rollouts of the same robot with the same cameras",
-            )
-    if check.dataset.fps != learnt.dataset.fps:
-        raise FieldError(
-            "dataset.root",
-            check.dataset.root,
-            f"has {check.dataset.fps} frames a second, the dataset that is learnt from {learnt.dataset.fps}",
-            "give rollouts at the same rate",
-        )
+    another. robot: that of the first."""
+    features, meta = learnt.dataset.features, check.dataset.meta
+    check_cameras(meta, [name for name, feature in features.items() if shows_colours(feature)])
+    widths = {name: features[name]["shape"][0] for name in (ACTION, OBS_STATE) if name in features}
+    check_widths(meta, widths)
+    check_same_robot(robot, meta)
     success = check.success[check.among(episodes)]
     if not tell_apart(success):
         raise FieldError(

@@ -89,10 +89,10 @@ class Plan:
         require_unreported(table, chosen, "choose others with `dataset.episodes`")
         if config.rollouts and isinstance(config.real_env, WmrlManiSkillEnv):
             require_mergeable(table.dataset, config.real_env)
+        robot = read_embodiment(table.dataset.meta, Embodiment())
         if config.check.given:
             with renamed("dataset", "check"):
-                require_checkable(read_episodes(config.check.open()), config.check.episodes, table)
-        robot = read_embodiment(table.dataset.meta, Embodiment())
+                require_checkable(read_episodes(config.check.open()), config.check.episodes, table, robot)
         check_units(
             policy,
             postprocessor,

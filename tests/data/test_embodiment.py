@@ -157,6 +157,8 @@ def test_a_dataset_of_another_robot_is_refused(tmp_path: Path) -> None:
     check_same_robot(own, meta)
     unnamed = record(tmp_path / "unnamed", degrees(10), names=["0", "1", "2"])
     check_same_robot(own, unnamed)
+    with pytest.raises(ValueError, match="0, 1, 2, the world model has learnt x, y"):
+        check_same_robot(Embodiment(action_names=["x", "y"]), unnamed)
     numbered = record(tmp_path / "numbered", degrees(10), names=["1_x", "2_y", "3_z"])
     with pytest.raises(ValueError, match="1_x, 2_y, 3_z, the world model has learnt shoulder"):
         check_same_robot(own, numbered)

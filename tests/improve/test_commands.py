@@ -24,6 +24,7 @@ from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.stages import MARKER
 from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
+from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve import commands, learnt
@@ -224,12 +225,17 @@ def test_episodes_to_check_on_are_looked_at_before_anything_is_trained(
     make_synthetic_dataset: Any, small_dataset: Any, tmp_path: Path
 ) -> None:
     table = read_episodes(small_dataset)
-    require_checkable(table, None, table)
+    robot = read_embodiment(small_dataset.meta, Embodiment())
+    require_checkable(table, None, table, robot)
+    larger = read_episodes(make_synthetic_dataset(tmp_path / "larger", size=48))
+    require_checkable(larger, None, table, robot)  # frames of any size are fitted to the tokenizer's
     with pytest.raises(FieldError, match=r"of its episodes 2 succeed and 0 fail, and a check needs both"):
-        require_checkable(table, [0, 1], table)
-    large = read_episodes(make_synthetic_dataset(tmp_path / "large", size=48))
-    with pytest.raises(FieldError, match=r"has observation.images.third_view as \[\(48, 48, 3\)"):
-        require_checkable(large, None, table)
+        require_checkable(table, [0, 1], table, robot)
+    with pytest.raises(FieldError, match="has 25 frames a second, the world model has learnt 30"):
+        require_checkable(table, None, table, replace(robot, fps=30))
+    other = read_episodes(make_synthetic_dataset(tmp_path / "other", cameras=("wrist",)))
+    with pytest.raises(FieldError, match=r"the dataset has no observation\.images\.third_view"):
+        require_checkable(other, None, table, robot)
 
 
 BOTH, EARLY, NEITHER = "both outcomes", "both, but held-out successes alone", "successes alone"

@@ -1,6 +1,8 @@
 """Imagined episodes, recorded as a LeRobotDataset: no simulator."""
 
 import itertools
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,10 +25,8 @@ from lerobot_wmrl.common.constants import KINDS, START_KIND, START_SCENE, START_
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
-from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.envs.world_recording import require_same_actions
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
@@ -109,14 +109,26 @@ def test_they_can_be_merged_with_the_dataset_that_they_begin_in(config, small_da
     assert merged.columns[START_SEED][-2:].tolist() == merged.columns[START_SEED][:2].tolist()
 
 
-FEWER = {"action_names": ["x", "y"], "action_low": [-1.0, -1.0], "action_high": [1.0, 1.0]}
+NAMED, ENDS = {"names": list("abcdefg")}, {"info": {"low": [-1.0] * 7, "high": [0.5] * 7}}
 
 
-@pytest.mark.parametrize("changed", [{"action_high": [0.5] * 7}, {"action_names": list("abcdefg")}, FEWER])
-def test_columns_of_another_robot_are_refused(small_dataset, changed):
-    robot = replace(read_embodiment(small_dataset.meta, Embodiment()), **changed)
-    with pytest.raises(FieldError, match=r"^like\.root=.*its actions are .*, those of the world model "):
-        require_same_actions(small_dataset.meta, robot)
+@pytest.mark.parametrize(
+    ("action", "fps", "problem"),
+    [
+        (NAMED, 25, "its action has the components a, b, c, d, e, f, g, the world model has learnt "),
+        (ENDS, 25, r"its actions range from \[-1.0, .* to \[0.5, .*, those of the world model: "),
+        ({}, 30, "has 30 frames a second, the world model has learnt 25"),
+    ],
+)
+def test_columns_of_another_robot_are_refused(config, small_dataset, tmp_path, action, fps, problem):
+    shutil.copytree(small_dataset.root, tmp_path / "other")
+    file = tmp_path / "other" / "meta" / "info.json"
+    info = json.loads(file.read_text())
+    info["features"]["action"].update(action)
+    file.write_text(json.dumps({**info, "fps": fps}))
+    config.like = DatasetSource(str(tmp_path / "other"))
+    with pytest.raises(FieldError, match=rf"^like\.root=.*: {problem}"):
+        record(config)
 
 
 def test_published_they_say_that_they_are_imagined(config, hub):
