@@ -160,7 +160,11 @@ def push_rows() -> dict[str, tuple[list[Cell], tuple[str, str, str]]]:
         "[25 + 1,000](docs/results.md#value_push)": (more, ("imagined_ppo", "ppo_distilled")),
     }
     for demonstrations in (25, 50):
-        cells = [c for c in read_all("value_same_recordings") if c["demonstrations"] == demonstrations]
+        cells = [
+            cell
+            for cell in read_all("value_same_recordings")
+            if (cell["demonstrations"], cell["rollouts"]) == (demonstrations, 300)
+        ]
         title = f"[{demonstrations} + 300](docs/results.md#value_same_recordings)"
         rows[title] = cells, ("imagined_ppo", "ppo_distilled")
     return {title: (cells, (best_bc(cells), *methods)) for title, (cells, methods) in rows.items()}

@@ -37,7 +37,8 @@ CHAPTERS: Final[Mapping[str, Mapping[str, Section]]] = {
     "Push": {
         "value_push": Section("Imagination against the best use of the same data", value.value_push),
         "value_same_recordings": Section(
-            "More demonstrations, on the same recordings for all methods", same_recordings.section
+            "More demonstrations or fewer rollouts, on the same recordings for all methods",
+            same_recordings.section,
         ),
         "value_rewards": Section("Rewards, and all methods on the same recordings", rewards.section),
         "value_longer": Section("Longer BC", partial(value.rows_above, ["longer", "longer_filtered"])),

@@ -1,4 +1,5 @@
-"""What imagination is worth with more demonstrations, on the same recordings: section of docs/results.md."""
+"""What imagination is worth with more demonstrations or fewer rollouts, on the same recordings: section of
+docs/results.md."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -28,17 +29,17 @@ LIMITS: Final = """\
 All methods of a seed have the same demonstrations and rollouts, and are compared on the same starts. The
 baseline is the one that succeeds most often on the reported starts, known and unseen together, which favours
 it; PPO in ManiSkill was not run here. Settings are those of [value_push](#value_push), where they were chosen
-with 8 demonstrations.
+with 8 demonstrations and 300 rollouts.
 `minutes` are upper bounds, beside other work."""
 
 
 def section(load: Load) -> str:
-    """Return the section: for each number of demonstrations success, and changes on the best baseline."""
+    """Return the section: for each number of real episodes success, and changes on the best baseline."""
     return "\n\n".join([*(part(cells) for cells in groups(load, STUDY, ()).values()), LIMITS])
 
 
 def part(cells: Sequence[Cell]) -> str:
-    """Return two tables of the cells of a number of demonstrations."""
+    """Return two tables of the cells of a number of real episodes."""
     methods = measured(cells, TITLES)
     rival = best_baseline(cells)
     rows = [
