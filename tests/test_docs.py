@@ -249,6 +249,14 @@ def test_the_objections_say_what_was_measured() -> None:
     ]
     known, unseen = (f"{', '.join(each[:-1])} and {each[-1]}" for each in over)
     assert f"by seed {known} points more than BC in known scenes, {unseen} in unseen ones" in text
+    without = read_all("value_without_noise")
+    calm, longer_calm = (mean_success(without, method) for method in ("noiseless", "longer_noiseless"))
+    first = [cell for cell in cells if cell["seed"] in {each["seed"] for each in without}]
+    noisy, longer = (mean_success(first, method) for method in ("filtered", "longer_filtered"))
+    assert (
+        f"Filtered BC has {calm} in place of {noisy}, with 9,000 steps {longer_calm} in place of {longer} "
+        in text
+    )
     (pick_place,) = groups(loader(ROOT / "docs"), SECOND_STUDY, SECOND_PARTS).values()
     for method, said in (
         ("longer_discounted_ppo", "by seed {} points more in known scenes, 1, 7"),
