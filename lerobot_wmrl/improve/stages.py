@@ -34,13 +34,14 @@ def list_stages(progress: Progress) -> list[Stage]:
     """List every stage that this improvement needs, in order."""
     plan, config = progress.plan, progress.plan.config
 
-    def can_compare(status: int) -> bool:
-        """Return whether there is a policy to compare with the one before."""
-        return plan.clones or plan.rl_checkpoint.exists()
+    def stopped_beside_others(status: int) -> bool:
+        """Return whether training stopped by a rule of its own, and there is a policy to compare with the one
+        before. After any other failure it can go on."""
+        return status == STOPPED and (plan.clones or plan.rl_checkpoint.exists())
 
     def leaves_policies(status: int) -> bool:
-        """Return whether RL stopped by a rule of its own, and there are policies to compare."""
-        return status == STOPPED and (can_compare(status) or config.distils)
+        """Return the same of RL: the policy that is fitted to a planner after it is one to compare too."""
+        return stopped_beside_others(status) or (status == STOPPED and config.distils)
 
     left_out = {
         StageName.COLUMNS: not plan.extra_columns,
@@ -51,7 +52,7 @@ def list_stages(progress: Progress) -> list[Stage]:
         StageName.DISTILLED: not config.distils,
         StageName.CHOICE: not config.selects,
     }
-    optional = {StageName.RL: leaves_policies, StageName.DISTILLED: can_compare}
+    optional = {StageName.RL: leaves_policies, StageName.DISTILLED: stopped_beside_others}
     return [
         Stage(
             name,

@@ -453,9 +453,10 @@ def test_rl_that_left_nothing_leaves_a_policy_of_successes_to_the_planner(tmp_pa
     write_json(tmp_path / "stages" / "rl.json", {"failed": "stopped: no episode was rewarded"})
     assert f"--policy.path={improvement.plan.policy}" in distilled.command()
     assert [*improvement.policies] == [SFT, FITTED]
-    assert not distilled.optional(1)
+    assert not distilled.optional(STOPPED)
     (tmp_path / "rl" / "checkpoints" / "last" / "pretrained_model").mkdir(parents=True)
-    assert distilled.optional(1)
+    assert distilled.optional(STOPPED)
+    assert not distilled.optional(1), "the same call goes on with it"
 
 
 @pytest.mark.parametrize(
@@ -497,8 +498,8 @@ def test_only_policies_for_which_it_was_measured_are_fitted_to_a_planner_after_p
     improvement = improvement_of(tmp_path, policy=kind(device="cpu", pretrained_path=tmp_path))
     assert [*improvement.policies] == names
     improvement.plan.rl_checkpoint.mkdir(parents=True)
-    optional = [stage.name for stage in list_stages(improvement) if stage.optional(1)]
-    assert optional == (["distilled"] if DISTILLED in names else [])
+    optional = [stage.name for stage in list_stages(improvement) if stage.optional(STOPPED)]
+    assert optional == (["rl", "distilled"] if DISTILLED in names else ["rl"])
     assert improvement.chosen() == names[-1]
 
 
