@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from experiments.page import four_tasks, value_figure
+from experiments.page import four_tasks, levers, value_figure
 from experiments.page.cells import Load
 from experiments.page.contents import CHAPTERS
 from experiments.study import ROOT, read_cells
@@ -57,7 +57,8 @@ def results_page() -> str:
     """Return docs/results.md."""
 
     load = loader(DOCS)
-    parts, contents, missing = [], [], []
+    parts, missing = [f'## What each change is worth<a id="levers"></a>\n\n{levers.section(load)}\n'], []
+    contents = ["- [What each change is worth](#levers)"]
     for chapter, sections in CHAPTERS.items():
         shown: list[str] = []
         for name, section in sections.items():
