@@ -94,7 +94,8 @@ def require_same_content(output_dir: Path, stored: Mapping[str, str], given: Map
             "output_dir",
             output_dir,
             f"was begun with another content of {', '.join(sorted(changed))}, under the same name",
-            "choose another folder, or restore what was there to continue",
+            "choose another folder, or restore what was there to continue (of a dataset on the hub, give the "
+            "commit that was downloaded then as its `revision`)",
         )
 
 

@@ -3,10 +3,10 @@
 import hashlib
 import logging
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import pyarrow.compute
 import pyarrow.dataset
@@ -16,11 +16,12 @@ from lerobot.datasets.dataset_metadata import CODEBASE_VERSION, LeRobotDatasetMe
 from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import EPISODES_DIR, BackwardCompatibilityError
-from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
+from lerobot.utils.constants import HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE
 from lerobot.utils.utils import SuppressProgressBars
 
 from lerobot_wmrl.common.errors import FieldError, first_line, renamed
 from lerobot_wmrl.common.flags import flag_as_typed
+from lerobot_wmrl.common.hub import cached_repo
 from lerobot_wmrl.data.embodiment import whole_rate
 from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes, require_chosen
 
@@ -63,6 +64,11 @@ class DatasetSource:
         """The folder, or the name on the hub, for messages and file names."""
         return self.root or self.repo_id or ""
 
+    def pinned(self, opened: Path) -> Self:
+        """Return this source with the commit that was opened, if it was downloaded: later the name may stand
+        for another. opened: the folder."""
+        return self if self.root or cached_repo(opened) is None else replace(self, revision=opened.name)
+
     def flags(self) -> dict[str, Any]:
         """Return the flags that name the dataset on a command line."""
         named = {"root": self.root} if self.root else {"repo_id": self.repo_id, "revision": self.revision}
@@ -89,22 +95,29 @@ class DatasetSource:
                 "is one of a dataset on the hub, and none is named",
                 "give `dataset.repo_id`, or leave it out",
             )
-        if not self.repo_id or (self.root and (is_whole(Path(self.root), episodes) or unfinished(self.root))):
+        root = self.root or self._recorded_here()
+        if not self.repo_id or (root and (is_whole(Path(root), episodes) or unfinished(root))):
             if self.revision:
                 logging.warning(
                     "dataset.revision=%s: %s holds a whole dataset, which is used as it is, whatever its "
                     "revision; give a new folder to download this one",
                     self.revision,
-                    self.root,
+                    root,
                 )
-            return open_dataset(self.root, self.repo_id, episodes)
+            return open_dataset(root, self.repo_id, episodes)
         try:
             return download_dataset(self.repo_id, self.revision, self.root or None, episodes)
         except FieldError as error:
-            here = self.root and (Path(self.root) / "meta" / "info.json").is_file()
+            here = root and (Path(root) / "meta" / "info.json").is_file()
             if not here or error.field == "dataset.episodes":
                 raise
-        return open_dataset(self.root, self.repo_id, episodes)  # which says what is missing there
+        return open_dataset(root, self.repo_id, episodes)  # which says what is missing there
+
+    def _recorded_here(self) -> str:
+        """Return where LeRobot's recorder leaves a dataset of this name, and LeRobot looks first; empty if
+        there is none."""
+        folder = HF_LEROBOT_HOME / self.repo_id if self.repo_id else None
+        return str(folder) if folder is not None and (folder / "meta" / "info.json").is_file() else ""
 
 
 @dataclass

@@ -8,10 +8,14 @@ import torch
 from lerobot.configs.video import DEPTH_METER_UNIT, DepthEncoderConfig, infer_depth_unit
 from lerobot.datasets.depth_utils import MM_PER_METRE, dequantize_depth
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.video_utils import decode_video_frames
+from lerobot.datasets.video_utils import FrameTimestampError, decode_video_frames
 from torch import Tensor
 
 from lerobot_wmrl.data.dataset import VIDEO_BACKEND
+
+NEAREST = 0.25
+"""How far a frame of a video may be from its time, as a share of the time between two: less than half of it,
+so that it is no other's."""
 
 DECODED = 256
 """Frames of a camera that are decoded at a time: those of a long episode would not fit into the memory."""
@@ -57,11 +61,17 @@ def decode_video(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -
         return decode_video_frames(
             path,
             times,
-            dataset.tolerance_s,
+            max(dataset.tolerance_s, NEAREST / dataset.fps),
             VIDEO_BACKEND,
             return_uint8=True,
             is_depth=key in dataset.meta.depth_keys,
         )
+    except FrameTimestampError as error:
+        raise ValueError(
+            f"dataset {dataset.root}: episode {episode}: {key}: {path.name} has no frame at the time of some "
+            f"row from {rows.start} to {rows.stop - 1}, to a quarter of the time between two. See that video "
+            "and rows belong together: copy or download the dataset again, or remove the episode"
+        ) from error
     except Exception as error:
         raise ValueError(
             f"dataset {dataset.root}: episode {episode}: {key}: {path.name} cannot be decoded ({error}). If "

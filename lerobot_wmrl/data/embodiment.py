@@ -75,12 +75,13 @@ def component_names(feature: Mapping[str, Any]) -> list[str]:
     return [str(name) for name in names]
 
 
-def read_embodiment(meta: Any, given: Embodiment) -> Embodiment:
+def read_embodiment(meta: Any, given: Embodiment, episodes: Sequence[int] | None = None) -> Embodiment:
     """Read what a dataset says about its robot.
 
     Args:
         meta: the dataset's metadata, a LeRobotDatasetMetadata.
         given: the user's settings; the action's range is taken from here where it is given.
+        episodes: those whose actions tell the range where nothing else does, all if None.
 
     Raises:
         FieldError: the range that is given or recorded has another number of components, is not finite, or
@@ -99,7 +100,7 @@ def read_embodiment(meta: Any, given: Embodiment) -> Embodiment:
     if not low and recorded is not None:
         (low, high), source = recorded, "dataset"
     if not low:
-        (low, high), source = observed_range(meta), "recorded actions"
+        (low, high), source = observed_range(meta, episodes), "recorded actions"
     check_range(low, high, names, "action.info.{}" if source == "dataset" else "embodiment.action_{}")
     embodiment = replace(
         given,
@@ -129,15 +130,28 @@ def whole_rate(rate: float, field: str, value: object) -> int:
 
 
 def recorded_range(feature: Mapping[str, Any]) -> tuple[list[float], list[float]] | None:
-    """Return the ends of a feature's range, None where the dataset does not say."""
+    """Return the ends of the action's range, None where the dataset does not say.
+
+    Raises:
+        FieldError: one end is missing, or is no list of numbers.
+    """
     info = feature.get("info") or {}
-    if LOW not in info or HIGH not in info:
+    if LOW not in info and HIGH not in info:
         return None
+    for name in (LOW, HIGH):
+        end = info.get(name)
+        if not isinstance(end, Sequence) or not all(isinstance(each, int | float) for each in end):
+            raise FieldError(
+                f"action.info.{name}",
+                end,
+                "must be a list of numbers, one for each component, as must be the other end",
+                "correct it in the dataset's meta/info.json, or leave both ends out",
+            )
     return list(map(float, info[LOW])), list(map(float, info[HIGH]))
 
 
-def observed_range(meta: Any) -> tuple[list[float], list[float]]:
-    """Guess the range of each component from the recorded actions.
+def observed_range(meta: Any, episodes: Sequence[int] | None = None) -> tuple[list[float], list[float]]:
+    """Guess the range of each component from the recorded actions of some episodes, all if None.
 
     It is that of the recorded values but the few greatest and least (`ISOLATED`), which may be wrong and
     would widen it at will: it reaches as far as these, but not beyond the others by more than a tenth of the
@@ -151,7 +165,7 @@ def observed_range(meta: Any) -> tuple[list[float], list[float]]:
             "has no files of data here, which say in what range its actions are",
             "download it: leave out `--dataset.streaming`",
         )
-    actions = read_vectors(Path(meta.root), ACTION)
+    actions = read_vectors(Path(meta.root), ACTION, episodes)
     finite = actions[np.isfinite(actions).all(1)]
     if not len(finite):
         raise FieldError("dataset.root", meta.root, "none of its actions is finite", "record it again")

@@ -338,9 +338,14 @@ def parquet_files(root: Path) -> list[Path]:
     return sorted((root / "data").glob("*/*.parquet"))
 
 
-def read_vectors(root: Path, name: str) -> np.ndarray:
-    """Read all of a column of numbers, such as the actions, of a dataset on disk. (rows, A) float64"""
-    table = pyarrow.dataset.dataset(parquet_files(root), format="parquet").to_table(columns=[name])
+def read_vectors(root: Path, name: str, episodes: Sequence[int] | None = None) -> np.ndarray:
+    """Read a column of numbers, such as the actions, of a dataset on disk, or what some episodes have of it.
+    (rows, A) float64"""
+    chosen = None
+    if episodes is not None:
+        chosen = pyarrow.compute.field("episode_index").isin(pyarrow.array(episodes, pyarrow.int64()))
+    rows = pyarrow.dataset.dataset(parquet_files(root), format="parquet")
+    table = rows.to_table(columns=[name], filter=chosen)
     column = table[name]
     values = pyarrow.compute.list_flatten(column) if pyarrow.types.is_nested(column.type) else column
     return values.to_numpy().astype(np.float64).reshape(table.num_rows, -1)

@@ -16,6 +16,9 @@ from lerobot_wmrl.common.images import to_pixels
 from lerobot_wmrl.data.checks import shows_colours
 from lerobot_wmrl.data.embodiment import HIGH, LOW, Embodiment
 
+EARLIER_NOTE, DEPTH_NOTE = "video.is_depth_map", "is_depth_map"
+"""What LeRobot called the note that a video shows depth, and what it calls it today."""
+
 
 def episode_features(observation: Observation, robot: Embodiment, camera: str) -> dict[str, dict[str, Any]]:
     """Describe the columns of what a robot does: a batch of its observations, actions, reward and success.
@@ -137,6 +140,19 @@ def encoder_of(columns: Mapping[str, Any]) -> RGBEncoderConfig | None:
     """Return the encoder of a dataset's videos, with which others can be merged; None if it has none."""
     videos = [each for each in columns.values() if each["dtype"] == "video" and shows_colours(each)]
     return RGBEncoderConfig.from_video_info(video_info(videos[0])) if videos else None
+
+
+def name_notes_anew(root: Path) -> None:
+    """Give the note that says whether a dataset's videos show depth the name that LeRobot has for it today.
+
+    Earlier versions called it otherwise, and LeRobot merges no datasets that differ in it.
+    """
+    info = load_info(root)
+    for feature in info.features.values():
+        notes = feature.get("info") or {}
+        if EARLIER_NOTE in notes:
+            notes[DEPTH_NOTE] = notes.pop(EARLIER_NOTE)
+    write_info(info, root)
 
 
 def describe_alike(root: Path, columns: Mapping[str, Any]) -> None:

@@ -159,14 +159,20 @@ def cached_features(dataset: LeRobotDataset, camera_keys: Sequence[str], tokeniz
 
 
 def episode_starts(dataset: LeRobotDataset) -> np.ndarray:
-    """Return each episode's first row. (E,) FieldError unless they follow each other."""
-    starts = np.asarray(dataset.meta.episodes["dataset_from_index"][:])  # slow row by row
-    if (np.diff(starts) <= 0).any():
+    """Return each episode's first row. (E,)
+
+    Raises:
+        FieldError: the table of episodes, by which pictures are found, says otherwise than the rows.
+    """
+    table = np.asarray(dataset.meta.episodes["dataset_from_index"][:])  # slow row by row
+    rows = dataset.hf_dataset.with_format("numpy", columns=["episode_index"])[:]["episode_index"]
+    starts: np.ndarray = np.unique(rows, return_index=True)[1]
+    if not np.array_equal(table, starts):
         raise FieldError(
             "dataset.root",
             dataset.root,
-            "its episodes' rows do not follow each other",
-            "write it anew with lerobot-edit-dataset",
+            "its table of episodes (meta/episodes) has them in other rows than the data",
+            "copy or download it again, or write it anew with lerobot-edit-dataset",
         )
     return starts
 

@@ -1,6 +1,6 @@
 """The general reward along recorded episodes: what a policy would have been paid for them, frame by frame."""
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -15,6 +15,9 @@ from lerobot_wmrl.rewards.general import general_reward, potential_discount
 from lerobot_wmrl.rewards.similarity import make_similarity
 from lerobot_wmrl.world_models.goal import imagine_goal, select_features
 from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardModel
+
+PART: Final = 64
+"""Frames that are compared with the goal at a time: features of a long episode would not fit into memory."""
 
 
 @torch.no_grad()
@@ -40,14 +43,21 @@ def reward_along_episode(
     """
     table, rows = recording.table, recording.rows(replay.episode)
     first = recording.starts(text_model, np.array([replay.episode]))
-    images = frames_to_tensor(recording.frames[rows]).to(first.tokens.device)
-    context = first.context[[0] * len(images)]
-    decoded = text_model.tokenizer.decode_with_features(text_model.tokenizer.encode(images, context), context)
     goal = imagine_goal(text_model, first, [table.instructions[replay.episode]])
-    measure, cameras = make_similarity(reward.similarity, images.device), text_model.tokenizer.num_cameras
-    every = torch.zeros(len(images), dtype=torch.long, device=images.device)
-    goal_features = select_features(measure.features(goal.decoded), every, cameras)
-    similarity = measure(measure.features(decoded), goal_features, cameras)
+    tokenizer, device = text_model.tokenizer, first.tokens.device
+    measure = make_similarity(reward.similarity, device)
+    goal_features = measure.features(goal.decoded)
+
+    def similarity_of(part: Tensor) -> Tensor:
+        context = first.context[[0] * len(part)]
+        decoded = tokenizer.decode_with_features(tokenizer.encode(part, context), context)
+        every = torch.zeros(len(part), dtype=torch.long, device=device)
+        wanted = select_features(goal_features, every, tokenizer.num_cameras)
+        return measure(measure.features(decoded), wanted, tokenizer.num_cameras)
+
+    frames = recording.frames[rows]
+    parts = (frames[at : at + PART] for at in range(0, len(frames), PART))
+    similarity = torch.cat([similarity_of(frames_to_tensor(part).to(device)) for part in parts])
     probability = replay.done_probability[:-1]
     earned = general_reward(
         paid_once(probability, criterion),
@@ -63,7 +73,7 @@ def reward_along_episode(
         "return": earned.cumsum(0).tolist(),
         "goal_reached": bool(goal.reached[0]),
         "goal_frame": to_pixels(goal.decoded.images[0]),
-        "final_frame": np.asarray(recording.frames[rows][-1]),
+        "final_frame": np.asarray(frames[-1]),
     }
 
 

@@ -112,6 +112,14 @@ class ImproveConfig(RunConfig):
             require_chunks(self.policy)
         if not self.dataset.given:
             raise FieldError("dataset.root", "", "is missing", "give `dataset.root` or `dataset.repo_id`")
+        for name in ("episodes", "revision"):
+            if getattr(self.check, name) is not None and not self.check.given:
+                raise FieldError(
+                    f"check.{name}",
+                    getattr(self.check, name),
+                    "is one of a dataset to check on, and none is named",
+                    "give `check.root` or `check.repo_id`, the dataset's own if these are its episodes",
+                )
         require_choice(self, "size", SIZES)
         require_at_least(self, 0, "rollouts", "selection_episodes")
         require_at_least(self, 1, "eval_episodes")

@@ -119,12 +119,24 @@ def require_mergeable(dataset: LeRobotDataset, env: WmrlManiSkillEnv) -> None:
 
 
 def require_checkable(
-    check: EpisodeTable, episodes: Sequence[int] | None, learnt: EpisodeTable, robot: Embodiment
+    check: EpisodeTable,
+    episodes: Sequence[int] | None,
+    learnt: EpisodeTable,
+    robot: Embodiment,
+    cameras: Sequence[str],
 ) -> None:
     """Raise FieldError unless a world model that learns from one dataset can be checked on these episodes of
-    another. robot: that of the first."""
+    another.
+
+    Args:
+        check: the other dataset.
+        episodes: those of it to check on, all if None.
+        learnt: the dataset that is learnt from.
+        robot: the robot that it shows.
+        cameras: keys of the cameras that the world model looks at.
+    """
     features, meta = learnt.dataset.features, check.dataset.meta
-    check_cameras(meta, [name for name, feature in features.items() if shows_colours(feature)])
+    check_cameras(meta, cameras)
     widths = {name: features[name]["shape"][0] for name in (ACTION, OBS_STATE) if name in features}
     check_widths(meta, widths)
     check_same_robot(robot, meta)

@@ -89,10 +89,13 @@ class Plan:
         require_unreported(table, chosen, "choose others with `dataset.episodes`")
         if config.rollouts and isinstance(config.real_env, WmrlManiSkillEnv):
             require_mergeable(table.dataset, config.real_env)
-        robot = read_embodiment(table.dataset.meta, Embodiment())
-        if config.check.given:
+        robot = read_embodiment(table.dataset.meta, Embodiment(), config.dataset.episodes)
+        check = config.check
+        if check.given:
             with renamed("dataset", "check"):
-                require_checkable(read_episodes(config.check.open()), config.check.episodes, table, robot)
+                checked = read_episodes(check.open())
+                require_checkable(checked, check.episodes, table, robot, [*policy.image_features])
+            check = check.pinned(checked.dataset.root)
         check_units(
             policy,
             postprocessor,
@@ -108,6 +111,7 @@ class Plan:
             check_frame_rate(config.real_env, table.dataset.fps, "the dataset")
         planned = copy(config)
         planned.policy = policy
+        planned.dataset, planned.check = config.dataset.pinned(table.dataset.root), check
         return cls(planned, findings, adapted)
 
     @property

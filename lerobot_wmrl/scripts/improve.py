@@ -43,7 +43,9 @@ def improve(cfg: ImproveConfig) -> None:
         "dataset": fingerprint(plan.findings.root),
         "policy": checkpoint_digest(str(cfg.policy.pretrained_path)),
     }
-    with Claim(cfg.output_dir, settings(cfg, stages), content=content, marker=MARKER).held():
+    # the same data may be named by the commit where a name on the hub has moved on
+    free = ("dataset.revision", "check.revision")
+    with Claim(cfg.output_dir, settings(cfg, stages), free, content, MARKER).held():
         plan.copy_policy()
         run_stages(stages, cfg.output_dir)
         page = Page.of(progress)

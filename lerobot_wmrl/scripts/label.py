@@ -30,6 +30,7 @@ from lerobot_wmrl.common.flags import flag_as_typed
 from lerobot_wmrl.common.lerobot_commands import edit_advice
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import SUCCESS
+from lerobot_wmrl.data.features import name_notes_anew
 from lerobot_wmrl.play import labels  # noqa: F401 (registers `by_hand`)
 from lerobot_wmrl.rewards.success_rules import (
     ColumnRule,
@@ -103,6 +104,7 @@ def write_labelled(dataset: "LeRobotDataset", success: np.ndarray, output_dir: P
                 dataset, SUCCESS, output_dir=Path(numbers, "unlabelled"), repo_id=repo_id
             )
         add_features(dataset, column, output_dir=partial, repo_id=repo_id)
+        name_notes_anew(partial)
 
 
 def report(runs: Sequence[int], cfg: LabelConfig) -> list[str]:

@@ -43,7 +43,11 @@ from lerobot_wmrl.maniskill.recordings import require_unreported
 from lerobot_wmrl.world_models.checkpoint import config_to_continue
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.training import build_model, held_out_metrics, train
-from lerobot_wmrl.world_models.training_data import decide_on_instructions, make_joint_sampler
+from lerobot_wmrl.world_models.training_data import (
+    decide_on_instructions,
+    decide_on_range,
+    make_joint_sampler,
+)
 
 TRAINED = ("frame_tokenizer", "action_world_model", "text_world_model")
 
@@ -172,6 +176,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
         link_latest(cfg.output_dir)
     if checkpoint is None:
         decide_on_instructions(cfg.model, table, cfg.dataset)
+        decide_on_range(cfg.model, table, cfg.dataset.episodes)
     model: Any = build_model(cfg.model, table, cfg.output_dir)
     if checkpoint is not None and int(checkpoint.name) >= cfg.steps:
         print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")

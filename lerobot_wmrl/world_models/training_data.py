@@ -14,6 +14,7 @@ from lerobot_wmrl.common.errors import FieldError, renamed
 from lerobot_wmrl.data.checks import check_episode_lengths, require_shown, solved_from_the_start
 from lerobot_wmrl.data.clips import ClipSampler, FrameSampler, InTurn
 from lerobot_wmrl.data.dataset import TrainingData
+from lerobot_wmrl.data.embodiment import read_embodiment
 from lerobot_wmrl.data.episodes import EpisodeTable, count_tasks
 from lerobot_wmrl.data.frame_cache import (
     FAR,
@@ -59,6 +60,13 @@ def decide_on_instructions(config: RewardModelConfig, table: EpisodeTable, data:
     if problem:
         logging.warning("success is told without the instructions, one of which cannot be read: %s", problem)
     config.tokenizer = replace(config.tokenizer, instructions=reads and not problem)
+
+
+def decide_on_range(config: RewardModelConfig, table: EpisodeTable, episodes: Sequence[int] | None) -> None:
+    """Write the range of the actions into the configuration of a new world model, as the chosen episodes tell
+    it: others may be left out because theirs are wrong."""
+    if episodes is not None and isinstance(config, ActionWorldModelConfig) and not config.pretrained_path:
+        config.embodiment = read_embodiment(table.dataset.meta, config.embodiment, episodes)
 
 
 def require_golden(table: EpisodeTable, episodes: np.ndarray) -> np.ndarray:

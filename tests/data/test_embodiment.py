@@ -4,6 +4,7 @@ import json
 import logging
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -95,6 +96,35 @@ def test_a_wrong_range_in_a_dataset_is_not_said_to_be_a_setting(tmp_path: Path) 
     meta = record(tmp_path / "data", degrees(), info=info)
     with pytest.raises(FieldError, match=rf"^action\.info\.low=.*{JOINTS[2]} would range from 5\.0 to 1\.0"):
         read_embodiment(meta, Embodiment())
+
+
+@pytest.mark.parametrize(
+    ("info", "wrong"),
+    [
+        ({"low": [0.0] * 3}, r"high=None"),
+        ({"low": 0, "high": [1.0] * 3}, "low=0"),
+        ({"low": [0.0] * 3, "high": [[1.0] * 3]}, "high="),
+        ({"low": ["x", "y", "z"], "high": [1.0] * 3}, "low="),
+    ],
+)
+def test_a_range_in_a_dataset_is_two_lists_of_numbers(info: Any, wrong: str, tmp_path: Path) -> None:
+    meta = record(tmp_path / "data", degrees(10), info=info)
+    with pytest.raises(
+        FieldError, match=rf"^action\.info\.{wrong}.*must be a list of numbers.*meta/info\.json"
+    ):
+        read_embodiment(meta, Embodiment())
+
+
+def test_episodes_that_are_left_out_do_not_widen_the_range(tmp_path: Path) -> None:
+    dataset = LeRobotDataset("local/joints", root=record(tmp_path / "data", degrees()).root)
+    resumed = LeRobotDataset.resume("local/joints", root=dataset.root)
+    for row in (100 * degrees()).astype(np.float32):
+        resumed.add_frame({"action": row, "observation.state": np.zeros(2, np.float32), "task": "reach"})
+    resumed.save_episode()
+    resumed.finalize()
+    meta = LeRobotDatasetMetadata("local/joints", root=dataset.root)
+    assert read_embodiment(meta, Embodiment()).action_high[0] == pytest.approx(9000)
+    assert read_embodiment(meta, Embodiment(), [0]).action_high[0] == pytest.approx(90)
 
 
 def test_one_wrong_value_does_not_widen_the_range(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -1,19 +1,24 @@
 """Frames of other sizes than the world model's."""
 
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import stretch
 from lerobot_wmrl.data import frame_cache
 from lerobot_wmrl.data.dataset import open_dataset
-from lerobot_wmrl.data.decoding import decode
+from lerobot_wmrl.data.decoding import decode, rows_of
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig, TokenizerConfig
@@ -56,10 +61,41 @@ def test_episodes_that_nobody_reads_are_not_decoded(
         make_sampler(model, read_episodes(small_dataset), [2], batch_size=2, seed=0)
 
 
-def test_episodes_whose_rows_are_out_of_order_are_refused() -> None:
-    meta = SimpleNamespace(episodes={"dataset_from_index": [0, 9, 5]})
-    with pytest.raises(ValueError, match=r"^dataset\.root=here: its episodes' rows do not follow each other"):
-        frame_cache.episode_starts(SimpleNamespace(meta=meta, root="here"))  # type: ignore[arg-type]
+def in_table(root: Path, column: str, change: Callable[[float], float]) -> LeRobotDataset:
+    """Change a column of the table of episodes, from the second one on."""
+    (file,) = root.rglob("meta/episodes/**/*.parquet")
+    table = pq.read_table(file)
+    first, *others = table[column].to_pylist()
+    changed = pa.array([first, *map(change, others)], table.schema.field(column).type)
+    pq.write_table(table.set_column(table.schema.get_field_index(column), column, changed), file)
+    return LeRobotDataset("local/changed", root=root)
+
+
+def test_a_table_of_episodes_that_has_them_in_other_rows_is_refused(
+    small_dataset: LeRobotDataset, tmp_path: Path
+) -> None:
+    """Pictures of one episode would be paired with actions of another."""
+    root = Path(shutil.copytree(small_dataset.root, tmp_path / "dataset"))
+    dataset = in_table(root, "dataset_from_index", lambda index: index - 1)
+    with pytest.raises(FieldError, match=r"^dataset\.root=.*has them in other rows than the data"):
+        frame_cache.episode_starts(dataset)
+
+
+def test_frames_may_be_shown_a_little_beside_their_time(
+    small_dataset: LeRobotDataset, tmp_path: Path
+) -> None:
+    """Up to a quarter of the time between two, where no other frame is as near."""
+    key, time = "observation.images.third_view", 1 / small_dataset.fps
+    root = Path(shutil.copytree(small_dataset.root, tmp_path / "dataset"))
+    dataset = in_table(root, f"videos/{key}/from_timestamp", lambda begin: begin + 0.2 * time)
+    rows = rows_of(dataset, 1)
+    np.testing.assert_array_equal(decode(dataset, 1, key, rows), decode(small_dataset, 1, key, rows))
+    dataset = in_table(root, f"videos/{key}/from_timestamp", lambda begin: begin + 0.1 * time)
+    said = (
+        f"episode 1: .* no frame at the time of some row from {rows.start} to {rows.stop - 1}, to a quarter"
+    )
+    with pytest.raises(ValueError, match=said):
+        decode(dataset, 1, key, rows)
 
 
 def test_caches_lie_beside_the_dataset_wherever_a_command_is_called(

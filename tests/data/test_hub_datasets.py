@@ -10,6 +10,7 @@ import pytest
 from lerobot.datasets import dataset_metadata, feature_utils, lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data import dataset as own_datasets
 from lerobot_wmrl.data import frame_cache
 from lerobot_wmrl.data.dataset import ChosenEpisodes, DatasetSource, TrainingData, open_dataset
@@ -85,6 +86,34 @@ def test_a_folder_that_lacks_files_and_is_on_no_hub_says_what_it_lacks(
     next((tmp_path / "torn" / "data").rglob("*.parquet")).unlink()
     with pytest.raises(ValueError, match=r"1 files are missing, the first is data/"):
         DatasetSource(str(tmp_path / "torn"), "somebody/nothing").open()
+
+
+def test_what_was_recorded_here_under_the_name_goes_before_the_hub(
+    published: LeRobotDataset, hub: Hub, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As LeRobot has it; that it is of no revision is said."""
+    own = own_datasets.HF_LEROBOT_HOME / NAME
+    shutil.copytree(published.root, own)
+    assert Path(DatasetSource(repo_id=NAME, revision="0123").open().root) == own
+    assert f"dataset.revision=0123: {own} holds a whole dataset" in caplog.text
+    shutil.rmtree(own / "meta" / "episodes")
+    with pytest.raises(FieldError, match="its recording was not finished"):
+        DatasetSource(repo_id=NAME).open()
+
+
+def test_what_was_downloaded_stays_what_is_learnt_from(published: LeRobotDataset, hub: Hub) -> None:
+    """Also where the name on the hub has moved on."""
+    source = ChosenEpisodes(repo_id=NAME, episodes=[0, 1])
+    root = Path(source.open().root)
+    pinned = source.pinned(root)
+    assert pinned.flags() == {
+        "dataset.repo_id": NAME,
+        "dataset.revision": root.name,
+        "dataset.episodes": [0, 1],
+    }
+    assert Path(pinned.open().root) == root
+    on_disk = ChosenEpisodes(root=str(published.root))
+    assert on_disk.pinned(Path(published.root)) == on_disk
 
 
 @pytest.mark.parametrize("folder", ["", "mine"])

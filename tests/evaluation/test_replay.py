@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from lerobot.utils.random_utils import set_seed
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.constants import KINDS
@@ -17,6 +18,7 @@ from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
 from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.evaluation import replay as replay_module
+from lerobot_wmrl.evaluation import reward_curves
 from lerobot_wmrl.evaluation.accuracy import (
     EpisodeAccuracy,
     absolute_control,
@@ -230,6 +232,28 @@ def test_episodes_of_which_nobody_knows_the_outcome_are_no_failures(small_datase
     assert (metrics["failures"], metrics["successes"], metrics["passed"]) == (0, 0, False)
     assert metrics["headline"]["done_f1"]["value"] is None
     assert (metrics["headline"]["psnr"]["episodes"], metrics["extreme_actions"]["episodes"]) == (6, 6)
+
+
+def test_a_long_episode_is_compared_with_the_goal_in_parts(source, model, trained_models, monkeypatch):
+    text_model = load_model(trained_models["text_world_model"], "text_world_model")
+
+    def similarity() -> list[float]:
+        set_seed(0)
+        criterion = SuccessCriterion(0.5, 3)
+        found = reward_along_episode(
+            text_model,
+            GeneralConfig(device="cpu", alpha=0.5),
+            source,
+            perfect(source, model, 0),
+            criterion=criterion,
+            longest=8,
+        )
+        return found["similarity"]
+
+    whole = similarity()
+    monkeypatch.setattr(reward_curves, "PART", 7)
+    assert similarity() == pytest.approx(whole, abs=1e-5)
+    assert len(whole) > 7
 
 
 def test_success_is_paid_once_in_the_frame_that_completes_it(source, model, trained_models):

@@ -226,16 +226,18 @@ def test_episodes_to_check_on_are_looked_at_before_anything_is_trained(
 ) -> None:
     table = read_episodes(small_dataset)
     robot = read_embodiment(small_dataset.meta, Embodiment())
-    require_checkable(table, None, table, robot)
+    cameras = ["observation.images.third_view"]
+    require_checkable(table, None, table, robot, cameras)
     larger = read_episodes(make_synthetic_dataset(tmp_path / "larger", size=48))
-    require_checkable(larger, None, table, robot)  # frames of any size are fitted to the tokenizer's
+    require_checkable(larger, None, table, robot, cameras)  # frames of any size are fitted to the tokenizer's
     with pytest.raises(FieldError, match=r"of its episodes 2 succeed and 0 fail, and a check needs both"):
-        require_checkable(table, [0, 1], table, robot)
+        require_checkable(table, [0, 1], table, robot, cameras)
     with pytest.raises(FieldError, match="has 25 frames a second, the world model has learnt 30"):
-        require_checkable(table, None, table, replace(robot, fps=30))
+        require_checkable(table, None, table, replace(robot, fps=30), cameras)
     other = read_episodes(make_synthetic_dataset(tmp_path / "other", cameras=("wrist",)))
     with pytest.raises(FieldError, match=r"the dataset has no observation\.images\.third_view"):
-        require_checkable(other, None, table, robot)
+        require_checkable(other, None, table, robot, cameras)
+    require_checkable(other, None, table, robot, ["observation.images.wrist"])
 
 
 BOTH, EARLY, NEITHER = "both outcomes", "both, but held-out successes alone", "successes alone"

@@ -220,6 +220,10 @@ def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, t
         (["--dataset.root=nowhere"], "no LeRobotDataset there"),
         (["--check.root=nowhere"], "--check.root=nowhere: no LeRobotDataset there"),
         (
+            ["--check.episodes=[0]"],
+            "--check.episodes=[0]: is one of a dataset to check on, and none is named",
+        ),
+        (
             ["--real_env.type=wmrl_maniskill"],
             "the policy needs observation.image, which real_env does not have",
         ),

@@ -1,12 +1,14 @@
 """lerobot-wmrl-label: the copy has `next.success` as the rule says, everything else as it was."""
 
 import re
+import shutil
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 import pytest
 from lerobot.datasets.dataset_tools import add_features, remove_feature
+from lerobot.datasets.io_utils import load_info, write_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.rewards.factory import make_reward_pre_post_processors
 from lerobot.rewards.sarm.configuration_sarm import SARMConfig
@@ -58,6 +60,21 @@ def test_demonstrations_succeed_at_their_ends(
     for row in (0, len(before) - 1):
         np.testing.assert_array_equal(before[row][IMAGE], after[row][IMAGE])
         np.testing.assert_array_equal(before[row]["action"], after[row]["action"])
+
+
+def test_copies_have_the_notes_of_today(
+    unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LeRobot merges no datasets of which one has those of an earlier version."""
+    earlier = shutil.copytree(unlabelled, tmp_path / "earlier")
+    info = load_info(earlier)
+    notes = info.features[IMAGE]["info"]
+    notes["video.is_depth_map"] = notes.pop("is_depth_map")
+    write_info(info, earlier)
+    for name, root in (("now", unlabelled), ("then", earlier)):
+        label(monkeypatch, root, tmp_path / name, "--success.type=ends")
+    now, then = (load_info(tmp_path / name).features for name in ("now", "then"))
+    assert now == then
 
 
 def test_other_labels_are_other_data(
