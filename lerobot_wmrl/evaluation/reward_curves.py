@@ -9,10 +9,12 @@ from torch import Tensor
 from lerobot_wmrl.common.images import to_pixels
 from lerobot_wmrl.common.success_criterion import SuccessCriterion
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
+from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import general_reward, potential_discount
-from lerobot_wmrl.rewards.similarity import make_similarity
+from lerobot_wmrl.rewards.similarity import Similarity, make_similarity
+from lerobot_wmrl.world_models.frame_tokenizer import Decoded
 from lerobot_wmrl.world_models.goal import imagine_goal, select_features
 from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardModel
 
@@ -44,20 +46,8 @@ def reward_along_episode(
     table, rows = recording.table, recording.rows(replay.episode)
     first = recording.starts(text_model, np.array([replay.episode]))
     goal = imagine_goal(text_model, first, [table.instructions[replay.episode]])
-    tokenizer, device = text_model.tokenizer, first.tokens.device
-    measure = make_similarity(reward.similarity, device)
-    goal_features = measure.features(goal.decoded)
-
-    def similarity_of(part: Tensor) -> Tensor:
-        context = first.context[[0] * len(part)]
-        decoded = tokenizer.decode_with_features(tokenizer.encode(part, context), context)
-        every = torch.zeros(len(part), dtype=torch.long, device=device)
-        wanted = select_features(goal_features, every, tokenizer.num_cameras)
-        return measure(measure.features(decoded), wanted, tokenizer.num_cameras)
-
-    frames = recording.frames[rows]
-    parts = (frames[at : at + PART] for at in range(0, len(frames), PART))
-    similarity = torch.cat([similarity_of(frames_to_tensor(part).to(device)) for part in parts])
+    frames, measure = recording.frames[rows], make_similarity(reward.similarity, first.tokens.device)
+    similarity = similarity_to_goal(text_model, measure, first, goal.decoded, frames)
     probability = replay.done_probability[:-1]
     earned = general_reward(
         paid_once(probability, criterion),
@@ -75,6 +65,25 @@ def reward_along_episode(
         "goal_frame": to_pixels(goal.decoded.images[0]),
         "final_frame": np.asarray(frames[-1]),
     }
+
+
+def similarity_to_goal(
+    text_model: TextWorldModelRewardModel, measure: Similarity, first: Frames, goal: Decoded, frames: Any
+) -> Tensor:
+    """Return how similar recorded frames, uint8 (T, N, H, W, 3), are to the imagined goal of their episode.
+    → (T,)"""
+    tokenizer, device = text_model.tokenizer, first.tokens.device
+    goal_features = measure.features(goal)
+
+    def of(part: Tensor) -> Tensor:
+        context = first.context[[0] * len(part)]
+        decoded = tokenizer.decode_with_features(tokenizer.encode(part, context), context)
+        every = torch.zeros(len(part), dtype=torch.long, device=device)
+        wanted = select_features(goal_features, every, tokenizer.num_cameras)
+        return measure(measure.features(decoded), wanted, tokenizer.num_cameras)
+
+    parts = (frames[at : at + PART] for at in range(0, len(frames), PART))
+    return torch.cat([of(frames_to_tensor(part).to(device)) for part in parts])
 
 
 def paid_once(probability: Tensor, criterion: SuccessCriterion) -> Tensor:
