@@ -3,6 +3,7 @@
 import logging
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import gymnasium as gym
@@ -28,11 +29,19 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         self.num_envs = env.num_envs
         self.metadata = env.metadata
         self.single_action_space, self.action_space = env.single_action_space, env.action_space
-        self.single_observation_space = numpy_space(env.single_observation_space)
-        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, env.num_envs)
         self._max_episode_steps = self.env.max_episode_steps
         self._clipped: list[float] = []
         self._seeds, self._repeats = set[int](), False
+
+    @cached_property
+    def single_observation_space(self) -> gym.Space[Any]:
+        """What one environment shows."""
+        return numpy_space(self.env.single_observation_space)
+
+    @cached_property
+    def observation_space(self) -> gym.Space[Any]:
+        """What all environments show."""
+        return gym.vector.utils.batch_space(self.single_observation_space, self.num_envs)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -69,12 +70,18 @@ class WorldModelVectorEnv(TensorEnv):
             self.action_low.cpu().numpy(), self.action_high.cpu().numpy()
         )
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, n_envs)
-        self.single_observation_space = self._observation_space()
-        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, n_envs)
         self.generator = torch.Generator(self.device)
         self.generator.seed()
 
-    def _observation_space(self) -> gym.spaces.Dict:
+    @cached_property
+    def observation_space(self) -> gym.Space[Any]:
+        """What all environments show. Training does not read it: its bounds take as much memory as frames."""
+        return gym.vector.utils.batch_space(self.single_observation_space, self.num_envs)
+
+    @cached_property
+    def single_observation_space(self) -> gym.spaces.Dict:
+        """What one environment shows."""
+
         def box(key: str, shape: tuple[int, ...]) -> gym.spaces.Box:
             low, high = (-np.inf, np.inf) if key == OBS_STATE else (0.0, 1.0)
             return gym.spaces.Box(low, high, shape, np.float32)
@@ -287,11 +294,12 @@ def load_spread_starts(model: ActionWorldModelRewardModel, source: StartFrames, 
     return load_starts(frames, model, None, make_similarity("tokenizer", model.device))[0]
 
 
-def make_success_env(env: WorldModelVectorEnv, starts: Starts) -> WorldModelVectorEnv:
+def make_success_env(env: WorldModelVectorEnv, starts: Starts, episodes: int) -> WorldModelVectorEnv:
     """Return an environment that counts successes from other starts: the world model that `env` has now, as
-    many imaginations, frames of the dataset's size, success as the reward and no goals."""
+    many imaginations but no more than `episodes`, frames of the dataset's size, success as the reward and no
+    goals."""
     reward = make_reward_model(GeneralConfig(alpha=1.0, device=env.device.type))
-    return WorldModelVectorEnv(env.model, starts, None, reward, env.config, env.num_envs)
+    return WorldModelVectorEnv(env.model, starts, None, reward, env.config, min(env.num_envs, episodes))
 
 
 def entropies(imagined: Imagined) -> dict[str, Tensor]:

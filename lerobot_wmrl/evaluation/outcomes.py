@@ -17,6 +17,7 @@ from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frame_cache import cached_features
 from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording, in_batches
 from lerobot_wmrl.world_models.checkpoint import check_dataset
+from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 from lerobot_wmrl.world_models.success import PredictedSuccess
 
@@ -186,7 +187,13 @@ def labelled_recording(model: ActionWorldModelRewardModel, table: EpisodeTable) 
     Raises:
         FieldError: the dataset does not fit the model, or has no labels of success.
     """
-    check_dataset(model.config, table.dataset.meta)
+    check_labelled(model.config, table)
+    return Recording.read(table, model)
+
+
+def check_labelled(config: WorldModelConfig, table: EpisodeTable) -> None:
+    """Raise FieldError for rollouts that a world model cannot replay, or whose success is not recorded."""
+    check_dataset(config, table.dataset.meta)
     if not table.has_labels:
         raise FieldError(
             "dataset.root",
@@ -194,7 +201,6 @@ def labelled_recording(model: ActionWorldModelRewardModel, table: EpisodeTable) 
             "has neither next.success nor next.done, which say whether success holds",
             "use rollouts with labels",
         )
-    return Recording.read(table, model)
 
 
 def predict_outcomes(model: ActionWorldModelRewardModel, recording: Recording) -> Outcomes:

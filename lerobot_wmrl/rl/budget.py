@@ -12,6 +12,7 @@ from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.ledger import Ledger
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.start_frames import check_starts
+from lerobot_wmrl.evaluation.outcomes import check_labelled
 from lerobot_wmrl.maniskill.recordings import require_unmeasured, require_unreported
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
 from lerobot_wmrl.world_models.checkpoint import check_dataset, read_config
@@ -30,6 +31,10 @@ def check_data(settings: CallbackSettings, env: EnvConfig) -> None:
             check_starts(env.dataset, ledger)
         if settings.dyna.rounds:
             check_rounds(settings, env)
+        if settings.gate.action != "off" and settings.gate.dataset.given:
+            config = read_config(env.world_model_path, "action_world_model", field="env.world_model_path")
+            with within("gate"):
+                check_labelled(config, read_episodes(settings.gate.dataset.open()))
     if settings.selection.dataset.given:
         with within("selection"):
             require_unmeasured(read_episodes(settings.selection.dataset.open()))

@@ -41,6 +41,8 @@ class DistillationConfig(AlgorithmConfig):
         last_updates: optimizer steps in the last iteration, on all labels.
         recorded: whether the policy also learns from the successful episodes of `env.dataset`, if there are
             any.
+        train_encoder: train the policy's encoder of observations too. It may come to fit imagined frames, and
+            recorded ones less well; `false` keeps it as it was. For the policy `cnn`.
         batch_size: labels in an optimizer step, in each process of `torchrun`.
     """
 
@@ -51,6 +53,7 @@ class DistillationConfig(AlgorithmConfig):
     updates: int = 150
     last_updates: int = 1000
     recorded: bool = True
+    train_encoder: bool = True
     batch_size: int = 32
 
     def __post_init__(self) -> None:

@@ -24,8 +24,10 @@ from lerobot_wmrl.common.distributed import (
 )
 from lerobot_wmrl.common.errors import FieldError, TrainingStopped
 from lerobot_wmrl.common.pipeline import Pipeline
+from lerobot_wmrl.common.policies import unwrapped
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.algorithm import Algorithm
+from lerobot_wmrl.rl.compatibility import require_encoder
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.expert_labels import (
     ExpertLabels,
@@ -33,6 +35,7 @@ from lerobot_wmrl.rl.expert_labels import (
     imagined_labels,
     recorded_successes,
     require_memory,
+    successes,
 )
 from lerobot_wmrl.rl.observations import as_read_back
 from lerobot_wmrl.rl.rollout import RolloutBuffer
@@ -76,6 +79,9 @@ class Distillation(Algorithm):
     def __init__(self, policy: Any, config: DistillationConfig, output_dir: Path) -> None:
         super().__init__(policy)
         self.config = config
+        if not config.train_encoder:
+            require_encoder(policy)
+            unwrapped(policy).freeze_encoder()
         self.preset = policy.config.get_optimizer_preset()
         if self.preset is None:
             raise FieldError(
@@ -85,6 +91,8 @@ class Distillation(Algorithm):
         self.optimizer = self.make_optimizers_and_scheduler()[self.name]
         self.windows = Windows.of(policy.config)
         self.labels = ExpertLabels(output_dir / LABELS_FOLDER, rank_and_size()[0])
+        self.has_read = not config.recorded
+        """Whether nothing recorded is left to read."""
 
     def make_optimizers_and_scheduler(self) -> dict[str, Optimizer]:
         """Return the policy's own optimizer in lerobot-train, at a constant rate."""
@@ -106,7 +114,8 @@ class Distillation(Algorithm):
         self, env: WorldModelVectorEnv, pipeline: Pipeline, rollout: RolloutBuffer, seed: int, last: bool
     ) -> dict[str, float]:
         started = time.perf_counter()
-        if self.config.recorded and not self.labels.recorded:
+        if not self.has_read:
+            self.has_read = True
             seen = self.lerobot_policy.config.input_features
             state_size = env.model.config.state_size if OBS_STATE in seen else 0
             self.labels.recorded = recorded_successes(
@@ -157,8 +166,8 @@ class Distillation(Algorithm):
         policy.reset()
         planner = self.make_planner(env, seed, self.learnt_components(env, pipeline))
         generator = torch.Generator().manual_seed(seed)
-        lead = int(torch.randint(self.config.longest_lead + 1, (), generator=generator))
-        lead = 0 if not self.iteration else min(lead, steps - 1)
+        longest = min(self.config.longest_lead, steps - 1, env.max_episode_steps - 1)
+        lead = int(torch.randint(longest + 1, (), generator=generator)) if self.iteration else 0
         actions = torch.zeros(steps, count, env.single_action_space.shape[0], device=env.device)
         acting = torch.zeros(steps, count, dtype=torch.bool, device=env.device)
         alive = torch.ones(count, dtype=torch.bool, device=env.device)
@@ -221,9 +230,10 @@ class Distillation(Algorithm):
     def check_dataset(self, env: WorldModelVectorEnv, pipeline: Pipeline) -> None:
         """Raise FieldError if recorded successes are learnt from, and do not fit into memory or vary in what
         the policy cannot learn."""
-        if not self.config.recorded:
+        source = env.config.dataset
+        if not (self.config.recorded and source.given and len(successes(source)[1])):
             return
-        require_memory(env.config.dataset, self.seen_shapes(env))
+        require_memory(source, self.seen_shapes(env))
         strange = (~self.learnt_components(env, pipeline)).nonzero().flatten().tolist()
         if strange:
             name = env.model.config.embodiment.action_names[strange[0]]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from termcolor import colored
 
-from lerobot_wmrl.common.errors import TrainingStopped
+from lerobot_wmrl.common.errors import TrainingStopped, within
 from lerobot_wmrl.common.seeds import gate_seed
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
@@ -99,7 +99,8 @@ class SuccessGate:
 
     def _labelled(self) -> Recording:
         """Read the labelled rollouts, and warn if the world model has learnt from them."""
-        rollouts = LabelledRollouts.read(self.config.dataset)
+        with within("gate"):
+            rollouts = LabelledRollouts.read(self.config.dataset)
         path = str(self.env.model.config.pretrained_path)  # of the newest one after Dyna rounds
         if learnt := learnt_from(path, rollouts):
             warning = (

@@ -108,4 +108,6 @@ def measure_imagined(
     env: WorldModelVectorEnv, policy: LoadedPolicy, starts: Starts, episodes: int
 ) -> PolicyEvaluation:
     """Run a policy from these starts in the world model that `env` has by now."""
-    return evaluate_within(make_success_env(env, starts), env.config, policy, episodes, SELECTION_SEED)
+    return evaluate_within(
+        make_success_env(env, starts, episodes), env.config, policy, episodes, SELECTION_SEED
+    )

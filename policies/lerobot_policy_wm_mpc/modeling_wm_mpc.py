@@ -1,5 +1,6 @@
 """Model-predictive control inside a world model, as a policy that lerobot-eval runs."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -42,7 +43,7 @@ class WmMpcPolicy(PreTrainedPolicy):
                 "has learnt from no successful episode",
                 "train it on a dataset with successes, or set `objective` to goal",
             )
-        if model.config.depth:
+        if model.config.depth or (text_model is not None and text_model.config.depth):
             raise FieldError(
                 "world_model_path",
                 config.world_model_path,
@@ -100,16 +101,18 @@ class WmMpcPolicy(PreTrainedPolicy):
         frames = Frames(tokens, state, self._context, instruction_weights=weights)
         proposed = None
         if self.proposal is not None:
-            proposed = self.proposal.actions(frames, batch, images, self.config.horizon)
+            own = replace(frames, state=state[:, : model.config.state_size])
+            proposed = self.proposal.actions(own, batch, images, self.config.horizon)
         return self.planner.plan(frames, instructions, proposed)
 
     def _state(self, batch: Observation, tokens: Tensor) -> Tensor:
-        """Return the robot's state (B, P), of no component where the world model has none.
+        """Return the robot's state (B, P), of no component where no world model has one.
 
         Raises:
-            FieldError: it is missing, or has another number of components than the world model has learnt.
+            FieldError: it is missing, or has another number of components than a world model has learnt.
         """
-        size = self.planner.model.config.state_size
+        models = [each for each in (self.planner.model, self.planner.text_model) if each is not None]
+        size = max(each.config.state_size for each in models)
         if not size:
             return tokens.new_zeros(len(tokens), 0, dtype=torch.float32)
         state: Tensor | None = batch.get(OBS_STATE)

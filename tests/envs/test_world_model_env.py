@@ -71,6 +71,16 @@ def test_policy_actions_are_what_the_policy_would_do_and_no_episode_moves(config
     torch.testing.assert_close(seen[IMAGE], observation[IMAGE])
 
 
+def test_spaces_take_no_memory_until_they_are_asked_for(env):
+    """Their bounds are as large as the frames of all environments."""
+    env.reset(seed=0)
+    env.step(env.action_low.expand(env.num_envs, -1))
+    spaces = {"observation_space", "single_observation_space"}
+    assert not spaces & vars(env).keys()
+    assert env.observation_space[IMAGE].shape[0] == env.num_envs
+    assert spaces <= vars(env).keys()
+
+
 def test_environments_with_one_seed_begin_alike(env):
     observation, _ = env.reset(seed=[1_000_003, 1_000_003, 4, 4])
     for values in (observation[IMAGE], observation[STATE]):
@@ -320,7 +330,8 @@ def test_compact_frames_become_those_that_a_policy_sees(config):
         later = env.step(torch.zeros(B, 7))[0]
         assert {each[IMAGE].shape[1:] for each in (first, later)} == {(3, 32, 32) if compact else (3, 48, 80)}
         seen.append([shown(each) for each in (first, later)])
-        assert make_success_env(env, env.starts).reset(seed=0)[0][IMAGE].shape == (B, 3, 48, 80)
+        assert make_success_env(env, env.starts, B + 1).reset(seed=0)[0][IMAGE].shape == (B, 3, 48, 80)
+        assert make_success_env(env, env.starts, 1).reset(seed=0)[0][IMAGE].shape == (1, 3, 48, 80)
     for full, stored in zip(*seen, strict=True):
         assert full.keys() == stored.keys()
         assert full[IMAGE].shape == (B, 3, 48, 80)

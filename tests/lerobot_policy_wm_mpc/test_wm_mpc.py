@@ -26,6 +26,7 @@ from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
 from lerobot_wmrl.world_models.planning import Planner, interpolate_knots, plan_knots, success_logit
 from tests.rl.checkpoints import save_untrained_policy
+from tests.trained import action_config, run_training, text_config
 
 SMALL = {"horizon": 8, "execute": 3, "samples": 6, "elites": 2, "iterations": 2, "knots": 3, "device": "cpu"}
 IMAGE = "observation.images.third_view"
@@ -189,6 +190,21 @@ def test_it_plans_anew_when_the_plan_is_carried_out(config, objective, small_dat
     assert (actions >= torch.tensor(ACTION_LOW) - 1e-6).all()
     assert (actions <= torch.tensor(ACTION_HIGH) + 1e-6).all()
     assert torch.allclose(actions[..., -1], torch.tensor(-1.0))  # the gripper's action never varied
+
+
+def test_the_goal_may_depend_on_a_state_that_the_action_world_model_has_not(
+    trained_models, small_dataset, tmp_path
+):
+    tokenizer, root = trained_models["frame_tokenizer"], Path(small_dataset.root)
+    folders = {size: tmp_path / str(size) for size in (0, 8)}
+    for size, folder in folders.items():
+        make = text_config if size else action_config
+        run_training(make(tokenizer, state_size=size or 0), root, folder)
+    config = WmMpcConfig(
+        world_model_path=str(folders[0]), text_world_model_path=str(folders[8]), objective="goal", **SMALL
+    )
+    plan = WmMpcPolicy(config).predict_action_chunk(observation(small_dataset, [0, 20]))
+    assert plan.shape == (2, SMALL["horizon"], 7)
 
 
 def test_episodes_that_begin_alike_are_planned_alike(config, small_dataset):

@@ -18,6 +18,8 @@ from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation.policy_rollouts import evaluate_policy
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
+from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
+from lerobot_wmrl.rl.distillation import Distillation
 from lerobot_wmrl.rl.minibatches import read_batch
 from lerobot_wmrl.rl.policy_adapters import INITIAL_STD, ActAdapter
 from lerobot_wmrl.rl.ppo import PPO
@@ -92,9 +94,11 @@ def test_the_first_ratio_is_one_and_the_value_leaves_act_alone(pipeline: Pipelin
     assert all(parameter.grad is not None for parameter in algorithm.policy.critic.parameters())
 
 
-def test_it_has_no_encoder_to_keep() -> None:
+def test_it_has_no_encoder_to_keep(tmp_path: Path) -> None:
     with pytest.raises(FieldError, match=r"algorithm\.train_encoder=False: this policy has no encoder"):
         PPO(small_act(), PPOConfig(train_encoder=False))
+    with pytest.raises(FieldError, match=r"algorithm\.train_encoder=False: this policy has no encoder"):
+        Distillation(small_act(), DistillationConfig(train_encoder=False), tmp_path)
 
 
 def test_act_is_saved_as_act_and_what_was_added_with_the_algorithm(

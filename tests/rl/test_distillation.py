@@ -36,6 +36,7 @@ from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
+from lerobot_wmrl.rl import distillation
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.expert_labels import (
     ExpertLabelBatch,
@@ -135,6 +136,40 @@ def test_it_trains_on_the_planners_successes_and_resumes_as_if_nothing_had_happe
         shutil.rmtree(output_dir / "checkpoints" / step)
     train(monkeypatch, *flags)
     assert all(torch.equal(value, after[name]) for name, value in weights(output_dir).items())
+
+
+def test_the_planner_has_its_turn_however_long_the_rollout_may_take(
+    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The policy's lead ends before the first episode can."""
+    policy, longer = save_untrained_policy(tmp_path / "policy", actions=7), "--algorithm.longest_lead=50"
+    unending = [flag for flag in imagined if "done_" not in flag] + ["--env.done_frames=2"]
+    whole_step = WorldModelVectorEnv.step
+
+    def step(env: WorldModelVectorEnv, actions: Tensor) -> tuple[Any, ...]:
+        """End every episode in success at its last step."""
+        observation, reward, terminated, truncated, info = whole_step(env, actions)
+        return observation, reward, terminated | truncated, torch.zeros_like(truncated), info
+
+    monkeypatch.setattr(WorldModelVectorEnv, "step", step)
+    flags = [f"--policy.path={policy}", *FAST, *unending, longer, "--rollout_steps=15"]
+    train(monkeypatch, *flags, f"--output_dir={tmp_path / 'rl'}")
+    labels = [int(line["labels"]) for line in read_metrics(tmp_path / "rl")]
+    assert all(later > earlier for earlier, later in zip([0, *labels], labels, strict=False))
+
+
+def test_an_encoder_may_stay_as_it_was(
+    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = save_untrained_policy(tmp_path / "policy", IMAGE, actions=7)
+    flags = [f"--policy.path={policy}", *FAST, *imagined, "--iterations=1", f"--output_dir={tmp_path / 'rl'}"]
+    train(monkeypatch, *flags, "--algorithm.train_encoder=false")
+    before, after = load_file(policy / "model.safetensors"), weights(tmp_path / "rl")
+    kept = {name for name, value in before.items() if torch.equal(value, after[name])}
+    encoder = {name for name in before if name.startswith("encoder.")}
+    assert encoder
+    assert encoder <= kept
+    assert any(name.startswith("actor.") for name in before.keys() - kept)
 
 
 def test_imagined_frames_are_kept_as_small_as_they_are_imagined(
@@ -459,6 +494,19 @@ def test_what_hardly_varied_where_the_policy_was_trained_is_left_as_it_is(
     for part in labels.imagined:
         actions = part.actions["action"]
         torch.testing.assert_close(actions, torch.full_like(actions, 0.01), atol=1e-3, rtol=0)
+
+
+def test_where_nothing_recorded_succeeds_nothing_of_it_is_learnt_and_it_is_read_once(
+    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That something in it varied and did not for the policy is no reason to stop."""
+    reads = []
+    monkeypatch.setattr(distillation, "recorded_successes", lambda *given: reads.append(given) or [])
+    stuck = save_untrained_policy(tmp_path / "policy", actions=7, constant=0.01)
+    flags = [f"--policy.path={stuck}", *FAST, *imagined, "--algorithm.recorded=true"]
+    train(monkeypatch, *flags, "--env.dataset.episodes=[2,5]", f"--output_dir={tmp_path / 'rl'}")
+    assert len(reads) == 1
+    assert len(read_metrics(tmp_path / "rl")) == 3
 
 
 def test_without_a_success_there_is_nothing_to_learn_from(

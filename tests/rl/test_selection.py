@@ -150,7 +150,7 @@ def test_success_is_measured_on_seeds_that_nothing_is_reported_on(
         monkeypatch.setattr(make_callbacks, name, seed_of)
     monkeypatch.setattr(make_callbacks, "WorldModelVectorEnv", Imagining)
     monkeypatch.setattr(make_callbacks, "load_spread_starts", lambda *_: range(9))
-    monkeypatch.setattr(make_callbacks, "make_success_env", lambda env, _: env)
+    monkeypatch.setattr(make_callbacks, "make_success_env", lambda env, *_: env)
     settings, policy = CallbackSettings(real_env=real_env), LoadedPolicy(CnnConfig(), None, None, None)
     measures: dict[str, Any] = make_callbacks.make_measures(settings, policy, env(2), config)
     assert {place: measure() for place, measure in measures.items()} == dict.fromkeys(places, SELECTION_SEED)

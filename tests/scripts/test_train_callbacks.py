@@ -263,6 +263,7 @@ def test_gate_and_selection_in_the_simulator(improve: Any, monkeypatch: pytest.M
         ([*POINT, "--dyna.rounds=1"], "no world model to refresh"),
         ([*POINT, "--selection.freq=-1"], "--selection.freq=-1: must be at least 0"),
         ([*POINT, "--gate.dataset.root=D"], "--gate.dataset.root=D: is read in a world model alone"),
+        ([*PUSH, "--gate.dataset.root=nowhere"], "--gate.dataset.root=nowhere: no LeRobotDataset there"),
         (
             [*POINT, "--selection.dataset.root=D"],
             "--selection.dataset.root=D: is read in a world model alone",
