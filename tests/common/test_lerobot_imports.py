@@ -41,7 +41,7 @@ UNDOCUMENTED = {
     "lerobot.datasets.factory": {"resolve_delta_timestamps"},
     "lerobot.datasets.io_utils": {"load_info", "write_info"},
     "lerobot.datasets.utils": {"EPISODES_DIR", "BackwardCompatibilityError"},
-    "lerobot.datasets.video_utils": {"decode_video_frames"},
+    "lerobot.datasets.video_utils": {"FrameTimestampError", "decode_video_frames"},
     "lerobot.envs.utils": {
         "NEW_ROLLOUT_OPTION",
         "FreezeAfterEpisodeEnd",
