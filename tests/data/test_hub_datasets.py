@@ -11,6 +11,7 @@ from lerobot.datasets import dataset_metadata, feature_utils, lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.data import dataset as own_datasets
 from lerobot_wmrl.data import frame_cache
 from lerobot_wmrl.data.dataset import ChosenEpisodes, DatasetSource, TrainingData, open_dataset
@@ -18,8 +19,11 @@ from lerobot_wmrl.data.decoding import decode, rows_of
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.evaluation.evidence import learnt_digests
+from lerobot_wmrl.improve.configuration_improve import ImproveConfig
+from lerobot_wmrl.improve.plan import Plan
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from tests.hub_server import Hub
+from tests.rl.checkpoints import save_untrained_policy
 from tests.trained import tokenizer_config
 
 NAME = "somebody/episodes"
@@ -114,6 +118,22 @@ def test_what_was_downloaded_stays_what_is_learnt_from(published: LeRobotDataset
     assert Path(pinned.open().root) == root
     on_disk = ChosenEpisodes(root=str(published.root))
     assert on_disk.pinned(Path(published.root)) == on_disk
+
+
+def test_all_stages_of_an_improvement_learn_from_what_was_downloaded_first(
+    published: LeRobotDataset, hub: Hub, tmp_path: Path
+) -> None:
+    policy = save_untrained_policy(tmp_path / "policy", actions=7)
+    config = ImproveConfig(
+        policy=read_policy_config(str(policy), []),
+        dataset=ChosenEpisodes(repo_id=NAME),
+        check=ChosenEpisodes(repo_id=NAME),
+        output_dir=tmp_path / "improve",
+    )
+    plan, commit = Plan.of(config), Path(config.dataset.open().root).name
+    for source in (plan.data, plan.config.check):
+        assert source.flags() == {"dataset.repo_id": NAME, "dataset.revision": commit}
+    assert config.dataset.revision is None, "so that the same command is recognised"
 
 
 @pytest.mark.parametrize("folder", ["", "mine"])

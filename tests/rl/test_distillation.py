@@ -152,7 +152,7 @@ def test_the_planner_has_its_turn_however_long_the_rollout_may_take(
         return observation, reward, terminated | truncated, torch.zeros_like(truncated), info
 
     monkeypatch.setattr(WorldModelVectorEnv, "step", step)
-    flags = [f"--policy.path={policy}", *FAST, *unending, longer, "--rollout_steps=15"]
+    flags = [f"--policy.path={policy}", *FAST, *unending, longer, "--rollout_steps=15", "--iterations=6"]
     train(monkeypatch, *flags, f"--output_dir={tmp_path / 'rl'}")
     labels = [int(line["labels"]) for line in read_metrics(tmp_path / "rl")]
     assert all(later > earlier for earlier, later in zip([0, *labels], labels, strict=False))

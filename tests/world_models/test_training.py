@@ -1,4 +1,5 @@
 import json
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,11 +19,12 @@ from lerobot_wmrl.common.presets import PRESETS, preset_settings
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.clips import ClipSampler, InTurn
 from lerobot_wmrl.data.dataset import ChosenEpisodes, TrainingData, open_dataset
+from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, cached_tokens
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
-from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
+from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from lerobot_wmrl.world_models import training_data
 from lerobot_wmrl.world_models.anchored import dynamics as anchored
 from lerobot_wmrl.world_models.autoregressive import dynamics as autoregressive
@@ -341,3 +343,24 @@ def test_weights_are_left_as_they_are_where_the_loss_has_no_gradient():
     with pytest.raises(ValueError, match=r"gradient's norm is inf; the last checkpoint is kept"):
         optimizer_step(model, model.weight.sqrt().sum(), optimizer, 1.0)
     assert model.weight.item() == 0
+
+
+def test_the_range_of_the_actions_is_that_of_the_chosen_episodes(small_dataset, trained_models, tmp_path):
+    """Others may be left out because theirs is wrong."""
+    root = Path(shutil.copytree(small_dataset.root, tmp_path / "data"))
+    info = json.loads((root / "meta" / "info.json").read_text())
+    del info["features"]["action"]["info"]  # which says the range
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    config = TrainWorldModelConfig(
+        model=action_config(trained_models["frame_tokenizer"]),
+        dataset=TrainingData(str(root), episodes=[0, 3]),
+        output_dir=tmp_path / "run",
+        steps=1,
+        batch_size=2,
+        precision="float32",
+    )
+    train_world_model(config)
+    found = load_model(tmp_path / "run", "action_world_model").config.embodiment
+    meta = open_dataset(root).meta
+    assert found == read_embodiment(meta, Embodiment(), [0, 3])
+    assert found != read_embodiment(meta, Embodiment())
