@@ -231,9 +231,12 @@ class Distillation(Algorithm):
         """Raise FieldError if recorded successes are learnt from, and do not fit into memory or vary in what
         the policy cannot learn."""
         source = env.config.dataset
-        if not (self.config.recorded and source.given and len(successes(source)[1])):
+        if not (self.config.recorded and source.given):
             return
-        require_memory(source, self.seen_shapes(env))
+        table, episodes = successes(source)
+        if not len(episodes):
+            return
+        require_memory(int(table.length[episodes].sum()), self.seen_shapes(env))
         strange = (~self.learnt_components(env, pipeline)).nonzero().flatten().tolist()
         if strange:
             name = env.model.config.embodiment.action_names[strange[0]]

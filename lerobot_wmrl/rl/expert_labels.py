@@ -223,13 +223,10 @@ def successes(source: StartFrames) -> tuple[EpisodeTable, np.ndarray]:
     return table, episodes[table.success[episodes]]
 
 
-def require_memory(source: StartFrames, frame_shapes: Mapping[str, tuple[int, int, int]]) -> None:
-    """Raise FieldError if the frames of `recorded_successes`, of which each process of `torchrun` on this
+def require_memory(frames: int, frame_shapes: Mapping[str, tuple[int, int, int]]) -> None:
+    """Raise FieldError if so many frames of `recorded_successes`, of which each process of `torchrun` on this
     machine has its own, do not fit into the free memory."""
-    if not source.given:
-        return
-    table, episodes = successes(source)
-    size = local_processes() * int(table.length[episodes].sum()) * sum(map(math.prod, frame_shapes.values()))
+    size = local_processes() * frames * sum(map(math.prod, frame_shapes.values()))
     free = psutil.virtual_memory().available
     if size > free:
         raise FieldError(

@@ -43,13 +43,14 @@ class WmMpcPolicy(PreTrainedPolicy):
                 "has learnt from no successful episode",
                 "train it on a dataset with successes, or set `objective` to goal",
             )
-        if model.config.depth or (text_model is not None and text_model.config.depth):
-            raise FieldError(
-                "world_model_path",
-                config.world_model_path,
-                "looks at depth, which environments do not show",
-                "plan in one without `dynamics.depth`",
-            )
+        for field, each in (("world_model_path", model), ("text_world_model_path", text_model)):
+            if each is not None and each.config.depth:
+                raise FieldError(
+                    field,
+                    getattr(config, field),
+                    "looks at depth, which environments do not show",
+                    "plan in one without `dynamics.depth`",
+                )
         low, high = model.action_range()
         self.planner = Planner(
             model,
@@ -111,16 +112,18 @@ class WmMpcPolicy(PreTrainedPolicy):
         Raises:
             FieldError: it is missing, or has another number of components than a world model has learnt.
         """
-        models = [each for each in (self.planner.model, self.planner.text_model) if each is not None]
-        size = max(each.config.state_size for each in models)
+        text_model, size = self.planner.text_model, self.planner.model.config.state_size
+        field = "world_model_path"
+        if text_model is not None and text_model.config.state_size > size:
+            field, size = "text_world_model_path", text_model.config.state_size
         if not size:
             return tokens.new_zeros(len(tokens), 0, dtype=torch.float32)
         state: Tensor | None = batch.get(OBS_STATE)
         if state is None or state.shape[-1] != size:
             shown = "is missing" if state is None else f"has {state.shape[-1]} components"
             raise FieldError(
-                "world_model_path",
-                self.config.world_model_path,
+                field,
+                getattr(self.config, field),
                 f"has learnt a state of {size} components, and {OBS_STATE} {shown}",
                 "plan where the world model's dataset was recorded, or train one without a state",
             )

@@ -205,6 +205,10 @@ def test_the_goal_may_depend_on_a_state_that_the_action_world_model_has_not(
     )
     plan = WmMpcPolicy(config).predict_action_chunk(observation(small_dataset, [0, 20]))
     assert plan.shape == (2, SMALL["horizon"], 7)
+    seen = observation(small_dataset, [0, 20])
+    del seen["observation.state"]
+    with pytest.raises(ValueError, match=r"^text_world_model_path=.* a state of 8 components, .* is missing"):
+        WmMpcPolicy(config).predict_action_chunk(seen)
 
 
 def test_episodes_that_begin_alike_are_planned_alike(config, small_dataset):

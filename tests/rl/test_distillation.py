@@ -293,13 +293,15 @@ def test_recorded_successes_are_labels_as_lerobots_datasets_give_them(
 def test_recorded_frames_that_do_not_fit_into_memory_are_refused(
     small_dataset: LeRobotDataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source, camera = StartFrames(root=str(small_dataset.root)), "observation.images.third_view"
-    size = successes(source)[0].length[successes(source)[1]].sum() * 3 * 32 * 32
+    camera = "observation.images.third_view"
+    table, episodes = successes(StartFrames(root=str(small_dataset.root)))
+    frames = int(table.length[episodes].sum())
+    size = frames * 3 * 32 * 32
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=size))
-    require_memory(source, {camera: (3, 32, 32)})
+    require_memory(frames, {camera: (3, 32, 32)})
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
     with pytest.raises(FieldError, match=r"recorded=True: .* 0.0 GB of memory, and 0.0 GB are free"):
-        require_memory(source, {camera: (3, 32, 32)})
+        require_memory(frames, {camera: (3, 32, 32)})
 
 
 def test_windows_of_imagined_observations_end_with_the_step_itself() -> None:
