@@ -61,9 +61,14 @@ CODES: Final = Source("codes")
 
 LEVERS: Final = {
     "Without a world model": (
-        Lever("successful rollouts too", "cloning", "filtered", (PUSH, TASKS, PICK_PLACE)),
-        Lever("these, three times as many steps", "filtered", "longer_filtered", (REWARDS, SAME, TASKS, ACT)),
-        Lever("the demonstrations alone, three times as many steps", "cloning", "longer", (SAME, TASKS)),
+        Lever("BC of successful rollouts too", "cloning", "filtered", (PUSH, TASKS, PICK_PLACE)),
+        Lever(
+            "filtered BC, three times as many steps",
+            "filtered",
+            "longer_filtered",
+            (REWARDS, SAME, TASKS, ACT),
+        ),
+        Lever("BC of the demonstrations, three times as many steps", "cloning", "longer", (SAME, TASKS)),
         Lever("weights in place of the filter (RA-BC)", "filtered", "weighted", (PUSH, PICK_PLACE)),
         Lever("advantage as an input in place of the filter (RECAP)", "filtered", "conditioned", (PUSH,)),
         Lever("rollouts without noise", "filtered", "noiseless", (PUSH,)),
@@ -71,7 +76,10 @@ LEVERS: Final = {
     ),
     "Reinforcement learning in imagination": (
         Lever(
-            "PPO, against what it begins from", START, "imagined_ppo", (REWARDS, SAME, TASKS, PICK_PLACE, ACT)
+            "PPO, against the policy that it begins from",
+            START,
+            "imagined_ppo",
+            (REWARDS, SAME, TASKS, PICK_PLACE, ACT),
         ),
         Lever(
             "PPO, against filtered BC of three times as many steps",
@@ -80,12 +88,25 @@ LEVERS: Final = {
             (REWARDS, SAME, TASKS, ACT),
         ),
         Lever(
-            "PPO in imagination in place of ManiSkill", "simulated_ppo", "imagined_ppo", (PUSH, PICK_PLACE)
+            "PPO in imagination in place of PPO in ManiSkill",
+            "simulated_ppo",
+            "imagined_ppo",
+            (PUSH, PICK_PLACE),
         ),
-        Lever("PPO from longer in place of filtered BC", "imagined_ppo", "longer_imagined_ppo", (PUSH,)),
-        Lever("PPO from longer BC, against that", "longer_filtered", "longer_imagined_ppo", (PICK_PLACE,)),
         Lever(
-            "the same, discount 0.989 in place of 0.97",
+            "PPO from longer filtered BC in place of filtered BC",
+            "imagined_ppo",
+            "longer_imagined_ppo",
+            (PUSH,),
+        ),
+        Lever(
+            "PPO, against the longer filtered BC that it begins from",
+            "longer_filtered",
+            "longer_imagined_ppo",
+            (PICK_PLACE,),
+        ),
+        Lever(
+            "PPO from longer filtered BC, discount 0.989 in place of 0.97",
             "longer_imagined_ppo",
             "longer_discounted_ppo",
             (PICK_PLACE,),
